@@ -25,8 +25,11 @@ if TYPE_CHECKING:
     from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
     from stereovox.fleet import FleetMap as FleetMap
     from stereovox.fleet import FleetPlan as FleetPlan
+    from stereovox.fleet import FleetScores as FleetScores
+    from stereovox.fleet import ScoreOptions as ScoreOptions
     from stereovox.fleet import map_fleet as map_fleet
     from stereovox.fleet import plan_fleet as plan_fleet
+    from stereovox.fleet import score_fleet as score_fleet
     from stereovox.floor_run import FloorRun as FloorRun
     from stereovox.floor_run import map_floor as map_floor
     from stereovox.formats import export as export
@@ -140,8 +143,11 @@ _HOMES = {
     "map_recording": "run",
     "FleetMap": "fleet",
     "FleetPlan": "fleet",
+    "FleetScores": "fleet",
+    "ScoreOptions": "fleet",
     "map_fleet": "fleet",
     "plan_fleet": "fleet",
+    "score_fleet": "fleet",
     "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",

@@ -18,7 +18,7 @@ import pytest
 import stereovox as sv
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
-from stereovox.fleet import Recording, boxes, fleet, map_fleet, recordings_of
+from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings_of
 from stereovox.fleet.recordings import boxes_with
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
@@ -310,7 +310,7 @@ def test_names_of_recordings(tmp_path):
 
 
 def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(fleet, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(cluster, "PATIENCE_S", 0.5)
     with pytest.raises(StereovoxError, match="no Dask scheduler answers"):
         map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, scheduler="tcp://127.0.0.1:9")
 

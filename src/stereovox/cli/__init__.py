@@ -52,6 +52,7 @@ COMMANDS = (
     "calibrate",
     "truth",
     "eval",
+    "score",
     "reproduce",
 )
 """Each is a module of this package with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`.

@@ -130,8 +130,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines.append(f"{frames}{size(result['memory_bytes'])} {loaded}")
     if boxes := result["boxes"]:
         lines.append(
-            f"in {thousands(boxes['number'])} boxes of {max(boxes['metres']):g} m, {boxes['levels']} coarser levels, "
-            f"{size(boxes['bytes'])}: only those that are asked for are read"
+            f"in {thousands(boxes['number'])} boxes of {max(boxes['metres']):g} m, {boxes['levels'] + 1} levels of "
+            f"detail, {size(boxes['bytes'])}: only those that are asked for are read"
         )
     if kept := result["kept_frames"]:
         lines.append(f"keeps {kept['frames']} of its frames, {size(kept['bytes'])}: poses can be corrected (remap)")

@@ -9,5 +9,18 @@ mapped from all trusted frames that see it.
 from stereovox.fleet.fleet import FleetMap, map_fleet
 from stereovox.fleet.plan import FleetPlan, plan_fleet
 from stereovox.fleet.recordings import Recording, RecordingReport, recordings_of
+from stereovox.fleet.scores import FleetScores, RecordingScore, ScoreOptions, score_fleet
 
-__all__ = ["FleetMap", "FleetPlan", "Recording", "RecordingReport", "map_fleet", "plan_fleet", "recordings_of"]
+__all__ = [
+    "FleetMap",
+    "FleetPlan",
+    "FleetScores",
+    "Recording",
+    "RecordingReport",
+    "RecordingScore",
+    "ScoreOptions",
+    "map_fleet",
+    "plan_fleet",
+    "recordings_of",
+    "score_fleet",
+]

@@ -4,19 +4,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from os import cpu_count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
-from uuid import uuid4
 
 from stereovox.config import Config, load_config
-from stereovox.errors import ConfigError, MapFileError, MissingExtra, StereovoxError
+from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.fleet.boxes import DONE, Box, DoneBox, boxes_of, done_before, map_box
+from stereovox.fleet.cluster import Cluster, cluster
 from stereovox.fleet.recordings import (
     RECORDINGS,
     Recording,
@@ -50,12 +48,6 @@ from stereovox.trust.history import History
 SETTINGS = "fleet.json"
 """The settings that a place's recordings are mapped with, written before anything else."""
 MAX_SETTINGS = 1 << 20
-LOST_WORKERS = 20
-"""Workers that may be lost with the same task before it is given up."""
-RETRIES = 2
-"""Times that a task that fails is tried again, on another worker if there is one."""
-PATIENCE_S = 10
-"""How long a scheduler may take to answer."""
 Progress = Callable[[int, int, str], object]
 """Called with steps done, steps in all, and the current activity."""
 ONE_MACHINE = {"window.size": None, "max_memory": None, "deadline_ms": None, "map.forget_s": None}
@@ -150,7 +142,7 @@ def map_fleet(
     check_boxed_target(place, (SETTINGS, f"{RECORDINGS}/", f"{DONE}/"))
     with only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
-        with _cluster(scheduler, workers) as run:
+        with cluster(scheduler, workers) as run:
             reports = _indexed(run, place, listed, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
@@ -239,78 +231,8 @@ def _known_layout(place: Place) -> BoxLayout | None:
         raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); choose another name for the map") from None
 
 
-class _Run:
-    """Runs tasks on a Dask cluster."""
-
-    def __init__(self, client: Any):
-        self._client, self._name = client, uuid4().hex  # another run's tasks of the same name write elsewhere
-
-    def results(
-        self,
-        function: Callable[..., Any],
-        tasks: Mapping[str, tuple[Any, ...]],
-        priority: Mapping[str, int] | None = None,
-    ) -> Iterator[tuple[str, Any]]:
-        """Yield name and result of tasks as they end, those of high priority begun first. A failure cancels the others.
-
-        Raises StereovoxError where a task fails, or cannot be done since its workers die or the scheduler is gone.
-        """
-        from distributed import KilledWorker, as_completed
-
-        submitted = {
-            self._client.submit(
-                function, *given, key=f"{function.__name__}-{self._name}-{name}", retries=RETRIES,
-                priority=(priority or {}).get(name, 0),
-            ): name
-            for name, given in tasks.items()
-        }  # fmt: skip
-        try:
-            for future in as_completed(list(submitted)):
-                yield submitted[future], future.result()
-        except KilledWorker as error:
-            raise StereovoxError(
-                f"the workers that had '{error.task}' died {LOST_WORKERS} times (too little memory?); what is done "
-                "stays, go on with --resume"
-            ) from None
-        except (OSError, TimeoutError) as error:
-            raise StereovoxError(f"the cluster is lost ({error}); what is done stays, go on with --resume") from None
-        except Exception as error:
-            if type(error).__name__ not in ("CancelledError", "FutureCancelledError", "CommClosedError"):
-                raise
-            raise StereovoxError("the scheduler is lost; what is done stays, go on with --resume") from None
-        finally:
-            self._client.cancel(list(submitted), force=True)
-
-
-@contextmanager
-def _cluster(scheduler: str | None, workers: int | None) -> Iterator[_Run]:
-    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it."""
-    try:
-        import dask.config
-        from distributed import Client, LocalCluster
-    except ImportError:
-        raise MissingExtra("dask[distributed]", "fleet") from None
-    with dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS}):
-        if scheduler is not None:
-            try:
-                client = Client(scheduler, timeout=PATIENCE_S)
-            except (OSError, ValueError, TimeoutError) as error:
-                raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
-            with client:
-                yield _Run(client)
-            return
-        number = workers or cpu_count() or 1
-        local: Any = LocalCluster(
-            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-            dashboard_address="127.0.0.1:0",
-        )  # fmt: skip
-        with local as cluster, Client(cluster) as client:
-            cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
-            yield _Run(client)
-
-
 def _indexed(
-    run: _Run, place: Place, listed: Sequence[Recording], layout: BoxLayout, progress: Progress
+    run: Cluster, place: Place, listed: Sequence[Recording], layout: BoxLayout, progress: Progress
 ) -> dict[Recording, RecordingReport]:
     """Return what each recording gave; those that were not mapped alone before are."""
     keys = {one.key(layout): one for one in listed}
@@ -359,7 +281,7 @@ def _done(place: Place) -> dict[str, DoneBox]:
 
 
 def _mapped(
-    run: _Run, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: dict[str, DoneBox], progress: Progress
+    run: Cluster, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: dict[str, DoneBox], progress: Progress
 ) -> dict[str, DoneBox]:
     """Return all boxes by what they are made of; those that no run before has mapped are mapped."""
     names = {box.inputs(layout): box for box in boxes}
@@ -379,7 +301,7 @@ def _mapped(
 
 
 def _levels(
-    run: _Run, place: Place, layout: BoxLayout, entries: Sequence[BoxEntry], progress: Progress
+    run: Cluster, place: Place, layout: BoxLayout, entries: Sequence[BoxEntry], progress: Progress
 ) -> list[list[BoxEntry]]:
     """Return the coarser levels, each made of the one before."""
     levels: list[list[BoxEntry]] = []

@@ -62,7 +62,7 @@ class Recording:
     def key(self, layout: BoxLayout) -> str:
         """Return a name made of all that is kept: the files, the poses, the settings and the boxes."""
         settings = [layout.side, layout.config.model_dump(mode="json", exclude={"threads"})]
-        files = [_fingerprint(self.where), None if self.poses is None else _fingerprint(self.poses)]
+        files = [fingerprint(self.where), None if self.poses is None else fingerprint(self.poses)]
         return digest([VERSION, self.where, files, settings])
 
 
@@ -196,14 +196,14 @@ def _mapped_alone(
 ) -> tuple[Path, list[NDArray[np.int64]]]:
     """Return the folder of the map of a recording, which kept its frames, and the boxes (n, 3) that each sees."""
     keeping, told = load_config(layout.config, **{"map.keep_frames": True}), list[NDArray[np.int64]]()
-    source = _local(recording.where, folder / "recording")
+    source = local(recording.where, folder / "recording")
     settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # others' worlds are not ours
     with MapRun(source, folder / "map", **settings, notify=notes.append) as run:
         run.mapper.map.listeners.append(lambda evidence: told.append(boxes_with(layout, evidence)))
         made = run.finish()
     if recording.poses is None:
         return folder / "map", _by_frame(layout, _all_kept(made.map), told)
-    remapped = remap(folder / "map", _local(recording.poses, folder / "poses"), folder / "remapped")
+    remapped = remap(folder / "map", local(recording.poses, folder / "poses"), folder / "remapped")
     return remapped.out, [_around(layout, frame) for frame in _all_kept(remapped.map)]
 
 
@@ -249,7 +249,7 @@ def boxes_with(layout: BoxLayout, evidence: Evidence) -> NDArray[np.int64]:
     return low + np.column_stack(np.unravel_index(found, sides))
 
 
-def _local(where: str, folder: Path) -> str:
+def local(where: str, folder: Path) -> str:
     """Return a recording as this machine can open it: that of an object store is copied to `folder`."""
     if not is_url(where):
         return where
@@ -309,7 +309,7 @@ def _listed(file: Path) -> list[Recording]:
     return found
 
 
-def _fingerprint(where: str) -> list[Any]:
+def fingerprint(where: str) -> list[Any]:
     """Return names, sizes and times of the files of a recording; nothing for simulations."""
     if is_url(where):
         above, _, name = where.rstrip("/").rpartition("/")

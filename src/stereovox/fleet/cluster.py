@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the tasks of a fleet run: a Dask cluster, on this machine or any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from os import cpu_count
+from typing import Any
+from uuid import uuid4
+
+from stereovox.errors import MissingExtra, StereovoxError
+
+LOST_WORKERS = 20
+"""Workers that may be lost with the same task before it is given up."""
+RETRIES = 2
+"""Times that a task that fails is tried again, on another worker if there is one."""
+PATIENCE_S = 10
+"""How long a scheduler may take to answer."""
+
+
+class Cluster:
+    """Runs tasks on a Dask cluster."""
+
+    def __init__(self, client: Any):
+        self._client, self._name = client, uuid4().hex  # another run's tasks of the same name write elsewhere
+
+    def results(
+        self,
+        function: Callable[..., Any],
+        tasks: Mapping[str, tuple[Any, ...]],
+        priority: Mapping[str, int] | None = None,
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield name and result of tasks as they end, those of high priority begun first. A failure cancels the others.
+
+        Raises StereovoxError where a task fails, or cannot be done since its workers die or the scheduler is gone.
+        """
+        from distributed import KilledWorker, as_completed
+
+        submitted = {
+            self._client.submit(
+                function, *given, key=f"{function.__name__}-{self._name}-{name}", retries=RETRIES,
+                priority=(priority or {}).get(name, 0),
+            ): name
+            for name, given in tasks.items()
+        }  # fmt: skip
+        try:
+            for future in as_completed(list(submitted)):
+                yield submitted[future], future.result()
+        except KilledWorker as error:
+            raise StereovoxError(
+                f"the workers that had '{error.task}' died {LOST_WORKERS} times (too little memory?); what is done "
+                "stays, go on with --resume"
+            ) from None
+        except (OSError, TimeoutError) as error:
+            raise StereovoxError(f"the cluster is lost ({error}); what is done stays, go on with --resume") from None
+        except Exception as error:
+            if type(error).__name__ not in ("CancelledError", "FutureCancelledError", "CommClosedError"):
+                raise
+            raise StereovoxError("the scheduler is lost; what is done stays, go on with --resume") from None
+        finally:
+            self._client.cancel(list(submitted), force=True)
+
+
+@contextmanager
+def cluster(scheduler: str | None, workers: int | None) -> Iterator[Cluster]:
+    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it."""
+    try:
+        import dask.config
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise MissingExtra("dask[distributed]", "fleet") from None
+    with dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS}):
+        if scheduler is not None:
+            try:
+                client = Client(scheduler, timeout=PATIENCE_S)
+            except (OSError, ValueError, TimeoutError) as error:
+                raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
+            with client:
+                yield Cluster(client)
+            return
+        number = workers or cpu_count() or 1
+        local: Any = LocalCluster(
+            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+            dashboard_address="127.0.0.1:0",
+        )  # fmt: skip
+        with local as cluster, Client(cluster) as client:
+            cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
+            yield Cluster(client)

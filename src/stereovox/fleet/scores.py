@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many recordings scored against their own lidars: a table like Valenti 2018, Table 8.1, made by a fleet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+from stereovox.config import Config, load_config
+from stereovox.errors import MapFileError, StereovoxError
+from stereovox.evaluate.lidar_truth import FREE, lidar_truth
+from stereovox.evaluate.metrics import Confusion
+from stereovox.evaluate.scores import score
+from stereovox.evaluate.truth_cells import TruthCells, level
+from stereovox.fleet.cluster import cluster
+from stereovox.fleet.fleet import Progress
+from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of
+from stereovox.maps.boxed_manifest import only_writer_at
+from stereovox.maps.store import MANIFEST
+from stereovox.opening import open_source
+from stereovox.places import Place
+from stereovox.pose_choice import GIVEN
+from stereovox.run import MapRun
+from stereovox.safe_io import json_value
+
+VERSION = 1
+"""Of what is kept of a score; another one is made anew."""
+SCORES, TABLE = "scores.json", "scores.csv"
+MAX_ROW = 1 << 22
+"""Bytes of what is kept of one recording."""
+COLUMNS: tuple[str, ...] = (
+    "recording", "profile", "frames", "refused", "tp", "fp", "tn", "fn", "accuracy", "precision", "recall",
+    "specificity", "npv", "error", "correlation", "tolerance_precision", "tolerance_recall", "coverage",
+)  # fmt: skip
+"""Of the table: those of Table 8.1, what they are of, and three that forgive cells beside each other."""
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """How maps are compared with the truth.
+
+    Attributes:
+        free: Which cells are free in truth: all others in `view`, or those that `rays` cross; see `lidar_truth`.
+        frames: Frames of each recording (`A:B:S`); None: all.
+        threshold: A cell is called occupied above it.
+        tolerance: Cells within which a surface counts as found.
+    """
+
+    free: str = "view"
+    frames: str | None = None
+    threshold: float = 0.7
+    tolerance: int = 1
+
+
+@dataclass(frozen=True)
+class RecordingScore:
+    """How good the map of one recording is.
+
+    Attributes:
+        recording: Its name.
+        profile: Of the map.
+        frames: Frames in the map.
+        refused: Refused frames.
+        scores: All measures, as `Scores.as_dict` names them; empty where there are none.
+        seconds: Time it took.
+        error: Why it has no scores, one line; "" where it has.
+    """
+
+    recording: str
+    profile: str
+    frames: int = 0
+    refused: int = 0
+    scores: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    error: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """Return its row of the table: a value for each of `COLUMNS`."""
+        known = {"recording": self.recording, "profile": self.profile, "frames": self.frames, "refused": self.refused}
+        return {name: known.get(name, self.scores.get(name)) for name in COLUMNS}
+
+
+@dataclass(frozen=True, eq=False)
+class FleetScores:
+    """Result of `score_fleet`.
+
+    Attributes:
+        scored: The score of each recording under each profile, in their order.
+        out: Folder or URL with `scores.csv` and `scores.json`.
+    """
+
+    scored: Sequence[RecordingScore]
+    out: str
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return the rows of the table, then one for all recordings of each profile.
+
+        That adds up the cells; its error is that of all observed cells together, and it has no correlation.
+        """
+        good = [one for one in self.scored if not one.error]
+        profiles = dict.fromkeys(one.profile for one in good)
+        return [*(one.row() for one in good), *(_all_of(name, [one for one in good if one.profile == name])
+                                                 for name in profiles)]  # fmt: skip
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `stereovox score --json`."""
+        broken = [f"{one.recording}: {one.error}" for one in self.scored if one.error]
+        return {"table": self.table(), "out": self.out, **({"doubts": broken} if broken else {})}
+
+
+def score_fleet(
+    recordings: Iterable[str | Path | Recording],
+    out: str | Path,
+    profiles: Iterable[str | Path | Config] = ("default",),
+    *,
+    options: ScoreOptions | None = None,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress = lambda done, total, doing: None,
+    **overrides: Any,
+) -> FleetScores:
+    """Map each of many recordings alone, and score its map against the truth that its lidar gives.
+
+    What is done stays: the same call with `resume` scores only recordings, profiles and settings that are new.
+
+    Args:
+        recordings: See `recordings_of`; each must have a lidar, as KITTI's have.
+        out: Folder or URL for `scores.csv` (the table) and `scores.json` (all measures).
+        profiles: Profiles to compare: names, TOML files or `Config`.
+        options: How maps are compared with the truth; None: as Valenti 2018 does.
+        resume: Go on with scores that are there.
+        workers: Processes of a cluster of this machine; None: one for each core.
+        scheduler: Address of a Dask scheduler (`tcp://host:8786`) in place of that.
+        progress: Called with steps done, steps in all, and the current activity.
+        **overrides: Settings by name, for all profiles.
+
+    Returns:
+        The scores; a recording without is told there.
+
+    Raises:
+        StereovoxError: One line: a setting or `options` is wrong, not one recording could be scored, or the cluster
+            failed.
+        MapFileError: Something else is at `out`, or it cannot be written.
+        MissingExtra: Dask or obstore is not installed.
+    """
+    options = _checked(options or ScoreOptions())
+    listed, place = recordings_of(recordings), Place.of(out)
+    configs = [load_config(profile, **overrides) for profile in profiles]
+    if not configs:
+        raise StereovoxError("no profile is named; give one or more")
+    _check_target(place, resume)
+    with only_writer_at(place):
+        keys = {one: _key(one, configs, options) for one in listed}
+        rows = {one: found for one in listed if (found := _scored_before(place, keys[one])) is not None}
+        tasks = {keys[one]: (place, keys[one], one, configs, options) for one in listed if one not in rows}
+        names = {key: one for one, key in keys.items()}
+        progress(len(rows), len(listed), "recordings")
+        with cluster(scheduler, workers) as run:
+            for key, found in run.results(score_recording, tasks):
+                rows[names[key]] = found
+                progress(len(rows), len(listed), "recordings")
+        scores = FleetScores([row for one in listed for row in rows[one]], str(out))
+        if all(row.error for row in scores.scored):
+            raise StereovoxError(f"not one recording could be scored ({scores.scored[0].error})")
+        place.write_all({SCORES: json.dumps([asdict(row) for row in scores.scored]).encode(), TABLE: _csv(scores)})
+    return scores
+
+
+def score_recording(
+    place: Place, key: str, recording: Recording, configs: Sequence[Config], options: ScoreOptions
+) -> list[RecordingScore]:
+    """Score a recording's maps under several settings, and keep that in a place; a task of a worker."""
+    truths, rows = dict[tuple[float, float], TruthCells](), list[RecordingScore]()
+    with TemporaryDirectory(prefix="stereovox-") as folder:
+        for number, config in enumerate(configs):
+            started = perf_counter()
+            try:
+                where = local(recording.where, Path(folder) / "recording")
+                sizes = config.voxel_size, config.max_range
+                if sizes not in truths:  # first: a recording without a lidar is not mapped for nothing
+                    source: Any = open_source(where)
+                    truth, _ = lidar_truth(source, *sizes, options.free, options.frames)
+                    truths[sizes] = TruthCells(truth, options.tolerance)
+                rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
+            except StereovoxError as error:
+                rows.append(RecordingScore(recording.where, config.profile, error=str(error)))
+            rows[-1] = RecordingScore(**{**vars(rows[-1]), "seconds": perf_counter() - started})
+    if not any(row.error for row in rows):  # what failed is tried again
+        (place / "scores").write(f"{key}.json", json.dumps([asdict(row) for row in rows]).encode())
+    return rows
+
+
+def _scored(
+    where: str, folder: Path, config: Config, truth: TruthCells, options: ScoreOptions, recording: Recording
+) -> RecordingScore:
+    settings: dict[str, Any] = {"profile": config, "poses": GIVEN, "checkpoint_s": 0, "frames": options.frames}
+    with MapRun(where, folder, **settings) as run:
+        made = run.finish().map
+    numbers = score(made, truth, options.threshold).as_dict()
+    return RecordingScore(recording.where, config.profile, made.frames, made.frames_refused, numbers)
+
+
+def _checked(options: ScoreOptions) -> ScoreOptions:
+    """Return how maps are compared; raises StereovoxError for bad values, before any work."""
+    level(options.threshold)
+    if options.free not in FREE:
+        raise StereovoxError(f"free '{options.free}' is not known; say {' or '.join(FREE)}")
+    if not 0 <= options.tolerance <= 8:
+        raise StereovoxError(f"tolerance {options.tolerance} must be 0 to 8 cells")
+    return options
+
+
+def _check_target(place: Place, resume: bool) -> None:
+    """Raise MapFileError where scores do not belong."""
+    if place.find(MANIFEST) is not None:
+        raise MapFileError(f"{place}: is a map; choose another name for the scores")
+    there = [name for name in place.names("") if not name.startswith(".")]
+    foreign = [name for name in there if name not in (SCORES, TABLE) and not name.startswith("scores/")]
+    if foreign:
+        raise MapFileError(f"{place}: holds other things ({foreign[0]}); choose another name for the scores")
+    if there and not resume:
+        raise MapFileError(f"{place}: there are scores already; go on with them with --resume, or choose another name")
+
+
+def _key(recording: Recording, configs: Sequence[Config], options: ScoreOptions) -> str:
+    """Return a name made of all that the scores depend on."""
+    settings = [config.model_dump(mode="json", exclude={"threads"}) for config in configs]
+    return digest([VERSION, recording.where, fingerprint(recording.where), settings, asdict(options)])
+
+
+def _scored_before(place: Place, key: str) -> list[RecordingScore] | None:
+    saved = (place / "scores").find(f"{key}.json", MAX_ROW)
+    try:
+        return None if saved is None else [RecordingScore(**row) for row in json_value(saved)]
+    except (TypeError, ValueError):
+        return None  # damaged: it is scored again
+
+
+def _all_of(profile: str, scored: Sequence[RecordingScore]) -> dict[str, Any]:
+    """Return the row of all recordings under one profile."""
+    counts = {name: sum(one.scores[name] for one in scored) for name in ("tp", "fp", "tn", "fn")}
+    observed = [one.scores["observed"]["cells"] for one in scored]
+    cells, errors = sum(observed), [one.scores["error"] or 0.0 for one in scored]
+    error = sum(n * error for n, error in zip(observed, errors, strict=True)) / cells if cells else None
+    known = {
+        "recording": "all", "profile": profile, "frames": sum(one.frames for one in scored),
+        "refused": sum(one.refused for one in scored), **counts, **Confusion(**counts).rates(), "error": error,
+        "coverage": cells / max(sum(counts.values()), 1),
+    }  # fmt: skip
+    return {name: known.get(name) for name in COLUMNS}
+
+
+def _csv(scores: FleetScores) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS)
+    writer.writeheader()
+    writer.writerows(scores.table())
+    return text.getvalue().encode()

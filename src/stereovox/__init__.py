@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from stereovox.cameras.lidar import Lidar as Lidar
     from stereovox.cameras.pinhole import PinholeCamera as PinholeCamera
     from stereovox.cameras.rigs import StereoPair as StereoPair
     from stereovox.cameras.wide import CylindricalCamera as CylindricalCamera
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from stereovox.formats import export as export
     from stereovox.formats import import_map as import_map
     from stereovox.formats.meshes import surface as surface
+    from stereovox.frame import Cloud as Cloud
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Photo as Photo
@@ -86,10 +88,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Lidar": "cameras.lidar",
     "PinholeCamera": "cameras.pinhole",
     "Config": "config",
     "load_config": "config",
     "StereovoxError": "errors",
+    "Cloud": "frame",
     "DepthImage": "frame",
     "Frame": "frame",
     "Photo": "frame",

@@ -9,10 +9,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, DepthImage
-from stereovox.integrate import Integrator
+from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
+from stereovox.integrate import Integration
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.evidence import Evidence
@@ -24,6 +25,8 @@ from stereovox.trust.gate import Gate, Passed
 SURFACES = (State.OCCUPIED, State.TENTATIVE)
 POINTS, BESIDE = 600, 3
 """Most pixels that are registered with the map, and the distance in pixels of the neighbours for their normals."""
+AROUND, FLAT = 16, 0.1
+"""Points of a cloud that give one its normal, and how flat they must lie: their spreads across and along."""
 STEPS = 30
 """Iterations of the registration."""
 REACH_M, REACH_CELLS = 0.6, 2.0
@@ -51,10 +54,10 @@ class Comparison:
     def check(
         self,
         frame: AnyFrame,
-        image: DepthImage,
+        image: AnyImage,
         evidence: Evidence,
         passed: Passed,
-        integrator: Integrator,
+        integrator: Integration,
         voxel_map: VoxelMap,
     ) -> tuple[Evidence, Passed]:
         """Return the evidence to add, and what the gate needs to accept the frame.
@@ -75,14 +78,14 @@ class Comparison:
             passed = self._gate.check_agreement(frame, passed, against, fits)
         return evidence, passed
 
-    def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:
+    def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Register the first image, so that kernels compile then and not when a frame is in doubt."""
         if not self._prepared:
             self._prepared = True
             pose_on_surfaces(voxel_map, image)
 
 
-def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None:
+def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     """Return a T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
 
     None where there is no such pose, or the image already lies there within a cell.
@@ -105,8 +108,10 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None
     return T if elsewhere else None
 
 
-def _surfaces(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the camera's frame."""
+def _surfaces(image: AnyImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the sensor's frame."""
+    if isinstance(image, CheckedCloud):
+        return _surfaces_of_cloud(image.ends[image.hits])
     height, width = image.depth_m.shape
     step = max(1, round((image.depth_m.size / POINTS) ** 0.5))
     rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
@@ -118,6 +123,20 @@ def _surfaces(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float6
     length = np.linalg.norm(normals, axis=-1)
     seen = np.isfinite(here).all(axis=-1) & np.isfinite(length) & (length > 0)
     return here[seen], normals[seen] / length[seen][:, None]
+
+
+def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some of these points and their normals, by the plane through the points around each."""
+    from scipy.spatial import KDTree
+
+    if len(points) < AROUND:
+        return np.empty((0, 3)), np.empty((0, 3))
+    some = points[:: max(1, len(points) // POINTS)]
+    _, near = KDTree(points).query(some, AROUND)
+    arms = points[near] - points[near].mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", arms, arms))
+    flat = spread[:, 0] < FLAT * spread[:, 1]  # a single ring of a lidar is a line, and has no normal
+    return some[flat], axes[flat, :, 0]
 
 
 def _points(image: DepthImage, v: NDArray[np.integer], u: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -141,7 +160,7 @@ def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDA
     return T
 
 
-def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
+def _fits_elsewhere(image: AnyImage, integrator: Integration, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
     """Return whether an image disagrees with the map by at most `limit` from where its surfaces lie on the map's.
 
     Registered with the centres of cells it may be half a cell off; from there the pose of least disagreement is sought
@@ -165,6 +184,6 @@ def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelM
     return least <= limit
 
 
-def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:
+def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera | Lidar) -> int:
     """Return the evidence in thousandths above which a hit is firm."""
     return round(FIRM * int(sensor_table(sensor, config, camera).hit.max()))

@@ -15,14 +15,16 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.depth import DepthPipeline
+from stereovox.depth.cloud import checked_cloud
 from stereovox.depth.prepare import downsample, shortened
 from stereovox.errors import ConfigError, FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Frame
-from stereovox.integrate import make_integrator
+from stereovox.frame import AnyFrame, AnyImage, Cloud, DepthImage, Frame
+from stereovox.integrate import Integration
 from stereovox.integrate.views import MAX_CAMERAS
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sensors.noise import RangeNoise
@@ -44,7 +46,7 @@ class Deadline:
     def __init__(self, config: Config):
         self._levels = [full_quality(config)] if config.deadline_ms is None else quality_levels(config)
         self._scheduler = Scheduler(len(self._levels), config.deadline_ms) if config.deadline_ms else None
-        self._warm: set[VirtualCamera] = set()
+        self._warm: set[VirtualCamera | Lidar] = set()
 
     def quality(self) -> Quality:
         """Return the quality level of the next frame. Raises FrameRefused `no_time` where it must be skipped."""
@@ -64,7 +66,7 @@ class Deadline:
         if self._scheduler is not None:
             self._scheduler.record(milliseconds)
 
-    def warm_up(self, frame: AnyFrame, camera: VirtualCamera) -> None:
+    def warm_up(self, frame: AnyFrame, camera: VirtualCamera | Lidar) -> None:
         """Run each camera's first frame through all other levels: no kernel then compiles when time is short."""
         if self._scheduler is None or camera in self._warm or len(self._warm) >= MAX_CAMERAS:
             return  # a source with another camera in each frame would warm up for ever
@@ -89,8 +91,8 @@ class DepthStage(Protocol):
 class Prepared(NamedTuple):
     """A frame ready for the integrator, and the milliseconds that took."""
 
-    frame: Frame  # with its depth, where that had to be matched
-    image: DepthImage
+    frame: Frame | Cloud  # with its depth, where that had to be matched
+    image: AnyImage
     match_ms: float
     depth_ms: float
 
@@ -107,13 +109,15 @@ class Quality:
 
     def __init__(self, name: str, depth: DepthStage, config: Config):
         self.name, self.depth = name, depth
-        self.integrator = make_integrator(config)
-        self.prepare = Ahead(partial(prepared, depth))  # without `self`, which would keep itself alive
+        self.integrator = Integration(config)
+        self.prepare = Ahead(partial(prepared, depth, config))  # without `self`, which would keep itself alive
 
 
-def prepared(depth: DepthStage, frame: AnyFrame) -> Prepared:
-    """Return the depth image of a frame. Raises FrameRefused as `depth`."""
+def prepared(depth: DepthStage, config: Config, frame: AnyFrame) -> Prepared:
+    """Return the depth image of a frame, or the checked cloud. Raises FrameRefused as `depth` or `checked_cloud`."""
     started = perf_counter()
+    if isinstance(frame, Cloud):  # at every level whole: its rays end where the level's integrator stops
+        return Prepared(frame, checked_cloud(frame, config), 0.0, 1e3 * (perf_counter() - started))
     depth_frame = depth.matched(frame)
     matched = started if depth_frame is frame else perf_counter()
     image = depth.image(depth_frame)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair, VirtualCamera
 from stereovox.se2 import flattened
@@ -229,13 +230,55 @@ class Scan:
         return flattened(self.T_world_sensor @ inverse(self.T_base_sensor))
 
 
-AnyFrame = Frame | StereoFrame
-"""What a camera source delivers and a mapper takes."""
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """The points that a lidar measured in one turn, or any other points that were seen along straight rays.
+
+    Attributes:
+        points: (N, 3) float32 or float64 metres in the sensor's frame (x forward, y left, z up). No value: not finite,
+            or all three 0; such a point clears nothing.
+        T_world_sensor: (4, 4) float64, maps the sensor's frame at `stamp_ns` into the world (z up).
+        stamp_ns: As in `Frame`.
+        lidar: What its ranges can be trusted for.
+        origins: (N, 3) metres in the same frame: where the sensor was when it measured each point, if it moved
+            meanwhile (`deskewed` makes them); None: at 0.
+        clear: (M, 3) metres in the same frame: ends of rays that met nothing, free all the way. None: nothing is known
+            of rays without a point.
+        name: As in `Frame`.
+        fault: As in `Frame`.
+        fault_detail: As in `Frame`.
+        sensor: As in `Frame`.
+        pose_off_ns: As in `Frame`.
+        pose_sigma: As in `Frame`.
+    """
+
+    points: NDArray[np.floating]
+    T_world_sensor: Transform
+    stamp_ns: int = 0
+    lidar: Lidar = field(default_factory=Lidar)
+    origins: NDArray[np.floating] | None = None
+    clear: NDArray[np.floating] | None = None
+    name: str = ""
+    fault: str | None = None
+    fault_detail: str = ""
+    sensor: str = ""
+    pose_off_ns: int = 0
+    pose_sigma: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def camera(self) -> Lidar:
+        """Return the lidar, under the name that all frames have."""
+        return self.lidar
+
+
+AnyFrame = Frame | StereoFrame | Cloud
+"""What a source delivers and a mapper takes."""
 
 
 def name_of(seen: AnyFrame | Scan) -> str:
     """Return the name of a frame or scan for messages."""
-    return seen.name or f"{'scan' if isinstance(seen, Scan) else 'frame'} at {seen.stamp_ns} ns"
+    kind = "scan" if isinstance(seen, Scan) else "cloud" if isinstance(seen, Cloud) else "frame"
+    return seen.name or f"{kind} at {seen.stamp_ns} ns"
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,3 +304,44 @@ class DepthImage:
     def viewpoint(self) -> Viewpoint:
         """Pose of the camera, and a pinhole for what it saw (of a wide camera, its middle)."""
         return Viewpoint(self.camera.middle, self.T_world_sensor, self.stamp_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedCloud:
+    """A checked cloud: rays that end at a surface, and rays that are only known to be free.
+
+    Attributes:
+        ends: (N, 3) float64 metres in the sensor's frame, all finite.
+        origins: (N, 3) where each ray begins; None: at 0.
+        hits: (N,) bool, whether there is a surface at the ray's end.
+        lidar: As in `Cloud`.
+        T_world_sensor: (4, 4) float64, exactly rigid.
+        stamp_ns: As in `Cloud`.
+    """
+
+    ends: NDArray[np.float64]
+    origins: NDArray[np.float64] | None
+    hits: NDArray[np.bool_]
+    lidar: Lidar
+    T_world_sensor: Transform
+    stamp_ns: int = 0
+
+    @property
+    def camera(self) -> Lidar:
+        """Return the lidar, under the name that all images have."""
+        return self.lidar
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """Pose of the sensor, as a camera that looks along its x axis."""
+        T = self.T_world_sensor.copy()
+        T[:3, :3] = T[:3, :3] @ R_SENSOR_OPTICAL
+        return Viewpoint(FORWARD, T, self.stamp_ns)
+
+
+AnyImage = DepthImage | CheckedCloud
+"""What integrators turn into evidence."""
+FORWARD = PinholeCamera.from_field_of_view(640, 480, 90)
+"""A camera that stands for a lidar where pictures are drawn from its place."""
+R_SENSOR_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Turns optical axes (x right, y down, z forward) into those of a sensor (x forward, y left, z up)."""

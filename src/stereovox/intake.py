@@ -9,7 +9,7 @@ from types import TracebackType
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Scan, UpdateReport
+from stereovox.frame import AnyFrame, AnyImage, Scan, UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
 from stereovox.threads import MapLock
@@ -72,7 +72,7 @@ class Offer:
         finally:
             self._intake._adding.release()
 
-    def check(self, image: DepthImage | Scan) -> Passed:
+    def check(self, image: AnyImage | Scan) -> Passed:
         """Check the frame, of which `image` was made, and return what `accept` needs. Raises as `Gate.check`."""
         intake = self._intake
         with intake._map.lock:

@@ -16,8 +16,8 @@ from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
 from stereovox.device import check_on_processor, on_usable_device
-from stereovox.errors import ConfigError, MapFileError
-from stereovox.frame import AnyFrame, Frame, Scan
+from stereovox.errors import ConfigError, FrameRefused, MapFileError
+from stereovox.frame import AnyFrame, Cloud, Frame, Scan, name_of
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
 from stereovox.integrate.beams import make_beams
@@ -91,7 +91,7 @@ class AnyMapper(Protocol[SeenT]):
 
 
 class Mapper:
-    """Builds a voxel map from depth images or stereo pairs.
+    """Builds a voxel map from depth images, stereo pairs or clouds of lidars.
 
     A frame that cannot be trusted is refused and changes nothing but the count of refusals.
 
@@ -133,7 +133,7 @@ class Mapper:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
         Args:
-            frame: Depth image or stereo pair, with the pose it was taken at.
+            frame: Depth image, stereo pair or cloud, with the pose it was taken at.
 
         Returns:
             What the frame changed and how long each step took, or why it was refused.
@@ -238,14 +238,20 @@ class Mapper:
         """Release what the map holds outside memory: nothing, unless it keeps tiles on disk."""
         self.map.close()
 
-    def _packed(self, frame: Frame, passed: Passed) -> Packed | None:
-        """Return the frame's depth image to be kept; None where it is not."""
+    def _packed(self, frame: Frame | Cloud, passed: Passed) -> Packed | None:
+        """Return the frame's depth image to be kept; None where it is not. FrameRefused `not_kept` for clouds."""
         kept = self.map.storage.kept
-        return None if kept is None or not kept.wants(passed.sensor, passed.seen) else Packed.of(frame)
+        if kept is None:
+            return None
+        if isinstance(frame, Cloud):
+            raise FrameRefused("not_kept", f"{name_of(frame)}: clouds cannot be kept; leave map.keep_frames out")
+        return Packed.of(frame) if kept.wants(passed.sensor, passed.seen) else None
 
-    def _keep(self, frame: Frame, packed: Packed | None, passed: Passed, quality: str, evidence: Evidence) -> None:
+    def _keep(
+        self, frame: Frame | Cloud, packed: Packed | None, passed: Passed, quality: str, evidence: Evidence
+    ) -> None:
         kept = self.map.storage.kept
-        if kept is not None and packed is not None:
+        if kept is not None and packed is not None and isinstance(frame, Frame):
             kept.keep(kept_frame(frame, packed, self.map.frames, passed.sensor, passed.seen, quality, evidence))
 
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import DepthImage, Frame, Viewpoint
-from stereovox.integrate import Integrator
+from stereovox.frame import AnyImage, Frame, Viewpoint
+from stereovox.integrate import Integration
 from stereovox.maps import _pool, make_map
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
@@ -70,7 +70,7 @@ class Prepared(Protocol):
     """A frame that is ready for the integrator."""
 
     @property
-    def image(self) -> DepthImage:
+    def image(self) -> AnyImage:
         """Its depth image."""
         ...
 
@@ -84,7 +84,7 @@ class Level(Protocol):
         ...
 
     @property
-    def integrator(self) -> Integrator:
+    def integrator(self) -> Integration:
         """Turns a depth image into evidence."""
         ...
 

@@ -11,15 +11,15 @@ import stereovox as sv
 from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats import export, import_map
-from stereovox.formats._lzf import unpack
 from stereovox.formats.bags import read_bag_grid, write_grid_bag
-from stereovox.formats.read_points import read_points
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.projection import project
+from stereovox.sources._lzf import unpack
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.robot_messages import read_transforms
 from stereovox.sources.bags.writer import BagWriter
+from stereovox.sources.point_files import read_points
 
 BAGS = (".bag", ".mcap", ".db3")
 
@@ -162,7 +162,7 @@ def test_points_of_other_programs(tmp_path, name):
 
 @pytest.mark.parametrize("piece", [1, 5, 33])
 def test_text_in_pieces(tmp_path, monkeypatch, piece):
-    monkeypatch.setattr("stereovox.formats.read_points.TEXT_PIECE", piece)
+    monkeypatch.setattr("stereovox.sources.point_files.TEXT_PIECE", piece)
     (tmp_path / "a.ply").write_bytes(SOUND["text.ply"] + b"3 0 1 2\nnot read any more")
     np.testing.assert_allclose(read_points(tmp_path / "a.ply").xyz, POINTS, rtol=1e-6)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.frame import DepthImage
+from stereovox.frame import CheckedCloud, DepthImage
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
 
@@ -45,6 +45,38 @@ def _shared(image: DepthImage, config: Config, sensor: InverseSensorModel, depth
     weight = np.minimum(1.0, (depths / (focal_px * config.voxel_size)) ** 2)  # Chien 2020, Eq 3.21
     cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
     return _known(cells, np.bincount(of_cell.ravel(), weight * evidence))
+
+
+def cast_points(cloud: CheckedCloud, config: Config, sensor: InverseSensorModel) -> Cells:
+    """Walk the ray of each point through all grid planes it crosses; the strongest evidence counts in each cell."""
+    noise, pose_noise = RangeNoise(cloud.lidar.sigma, 0, 0), PoseNoise.of(config.noise)
+    table = tabulate(sensor, noise, config.max_range, config.voxel_size, pose_noise)
+    table = replace(table, **{name: np.round(getattr(table, name), 3) for name in ("log_odds", "hit", "passed")})
+    T, size = cloud.T_world_sensor, np.array(config.cell)
+    reach = REACH_SIGMA * table.sigma
+    marks = bool((table.log_odds > 0).any())
+    indices, evidence = [np.empty((0, 3), np.int64)], [np.empty(0)]
+    for number, end in enumerate(cloud.ends):
+        origin = np.zeros(3) if cloud.origins is None else cloud.origins[number]
+        start, point = (T[:3, :3] @ place + T[:3, 3] for place in (origin, end))
+        length = np.linalg.norm(point - start)
+        direction = (point - start) / length
+        hit = cloud.hits[number] and length <= config.max_range
+        d = length if hit else np.inf
+        row = _row(table, min(d, config.max_range))
+        free = min(max(length - (reach[-1] if cloud.hits[number] else 0), 0), config.max_range)
+        middle = _crossed(start / size, direction / size, d + (reach[row] if marks else 0) if hit else free)
+        cells = np.floor((start + middle[:, None] * direction) / size).astype(np.int64)
+        given = _look_up(table, middle, np.full(len(middle), d), config)
+        most = np.where(middle > config.blind, table.passed[_row(table, np.minimum(middle, config.max_range))], 0)
+        given = np.maximum(given, most)
+        if hit:
+            its = np.floor(point / size).astype(np.int64)
+            others = (cells != its).any(axis=1)
+            cells, given = np.vstack([cells[others], its]), np.append(given[others], table.hit[row])
+        indices.append(cells)
+        evidence.append(given)
+    return _strongest(np.concatenate(indices), np.concatenate(evidence))
 
 
 def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:

@@ -28,6 +28,7 @@ class DepthPipeline:
         if isinstance(frame, Frame):
             return frame  # `prepare` validates its fields
         validate_fields(frame, StereoFrame, Frame)
+        assert isinstance(frame, StereoFrame)
         check_light(frame, self._config.trust.max_unexposed_share)
         return self._stereo(frame)
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
-from stereovox.formats.clouds import Cloud, map_of_cloud
+from stereovox.formats.clouds import PointFile, map_of_cloud
 from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_of_nodes
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
@@ -90,7 +90,7 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
 
     def cloud_cells(wire: Wire) -> VoxelMap:
         points = np.asarray(read_point_cloud(wire).points, np.float64).reshape(-1, 3)
-        cloud = Cloud(points, f"{POINT_CLOUD}, {len(points):,} points", metres=((1.0, 1.0, 1.0), "metres"))
+        cloud = PointFile(points, f"{POINT_CLOUD}, {len(points):,} points", metres=((1.0, 1.0, 1.0), "metres"))
         return map_of_cloud(cloud, path_name, voxel_size, origin=(0.0, 0.0, 0.0))
 
     return _last(Path(path), topic, {OCTOMAP: octomap_cells, POINT_CLOUD: cloud_cells})

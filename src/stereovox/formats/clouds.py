@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats.cell_size import SuggestedCell, extents, suggested_cell, suggested_for_mesh
 from stereovox.formats.las import read_las
-from stereovox.formats.read_points import MAX_BYTES, cells_of_points, read_points
+from stereovox.formats.read_points import cells_of_points
 from stereovox.formats.text_points import read_text_points
 from stereovox.maps import VoxelMap
 from stereovox.safe_io import read_bounded
 from stereovox.sources.lidar import read_velodyne
+from stereovox.sources.point_files import MAX_BYTES, read_points
 from stereovox.trust.history import Imported
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937}
@@ -44,7 +45,7 @@ TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
 LAS = (".las", ".laz")
 
 
-class Cloud(NamedTuple):
+class PointFile(NamedTuple):
     """Points as they stand in a file.
 
     xyz: (N, 3) float64, in the file's unit and frame; not finite where there is none. holds: what the file is, in a few
@@ -81,17 +82,17 @@ def read_cloud_map(
         raise MapFileError(f"{path}: {error}") from None
 
 
-def read_cloud(path: str | Path) -> Cloud:
+def read_cloud(path: str | Path) -> PointFile:
     """Return the points of a file with one of the endings `formats.CLOUDS`.
 
     Raises MapFileError, MissingExtra where the library for `.las` is not installed.
     """
     ending = Path(path).suffix.lower()
     if ending in LAS:
-        return Cloud(**read_las(path)._asdict())
+        return PointFile(**read_las(path)._asdict())
     if ending in TEXTS:
         xyz = read_text_points(path)
-        return Cloud(xyz, f"text, {_count(xyz)}")
+        return PointFile(xyz, f"text, {_count(xyz)}")
     if ending == ".bin":
         return _lidar_scan(path)
     if ending in MESHES:
@@ -102,11 +103,11 @@ def read_cloud(path: str | Path) -> Cloud:
     kind = "PLY" if points.ply else "PCD"
     rows = f"{points.width} x {points.height}, " if points.height > 1 else ""
     notes = ("its VIEWPOINT is not applied: points lie as the file has them",) if points.turned else ()
-    return Cloud(points.xyz, f"{kind}, {rows}{_count(points.xyz)}", points.voxel_size, notes=notes)
+    return PointFile(points.xyz, f"{kind}, {rows}{_count(points.xyz)}", points.voxel_size, notes=notes)
 
 
 def map_of_cloud(
-    cloud: Cloud,
+    cloud: PointFile,
     name: str,
     voxel_size: float | None = None,
     unit: str | None = None,
@@ -135,7 +136,7 @@ def _count(xyz: NDArray[np.float64]) -> str:
     return f"{int(np.isfinite(xyz).all(axis=1).sum()):,} points"
 
 
-def _in_metres(cloud: Cloud, unit: str | None) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def _in_metres(cloud: PointFile, unit: str | None) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Return the points in metres, and a note where the file decided that; raises StereovoxError for a bad unit."""
     if unit is not None:
         if unit not in UNITS:
@@ -170,7 +171,7 @@ def _point(point: NDArray[np.float64]) -> str:
 
 
 def _sized(
-    xyz: NDArray[np.float64], cloud: Cloud, name: str, voxel_size: float | None, unit: str | None
+    xyz: NDArray[np.float64], cloud: PointFile, name: str, voxel_size: float | None, unit: str | None
 ) -> tuple[float, tuple[str, ...]]:
     """Return the side of a cell, and notes: why it was chosen, and where the unit is doubtful."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
@@ -188,7 +189,7 @@ def _sized(
 
 
 def _unit_notes(
-    xyz: NDArray[np.float64], cloud: Cloud, unit: str | None, suggested: SuggestedCell | None
+    xyz: NDArray[np.float64], cloud: PointFile, unit: str | None, suggested: SuggestedCell | None
 ) -> tuple[str, ...]:
     """Return a note where nobody says the unit of points (N, 3) and metres may be the wrong one."""
     length = float(extents(xyz).max())
@@ -236,7 +237,7 @@ def _shares(steps: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.flo
     return owner, number / np.maximum(steps, 1)[owner]
 
 
-def _lidar_scan(path: str | Path) -> Cloud:
+def _lidar_scan(path: str | Path) -> PointFile:
     """Return the points of a KITTI velodyne scan, in the frame of the lidar."""
     try:
         xyz = read_velodyne(Path(path)).astype(np.float64)
@@ -244,10 +245,10 @@ def _lidar_scan(path: str | Path) -> Cloud:
         raise MapFileError(str(error)) from None
     if not len(xyz) or np.abs(xyz).max() > MAX_LIDAR_M:
         raise MapFileError(f"{path}: no KITTI velodyne scan (float32 x, y, z, reflectance); save it as .ply or .pcd")
-    return Cloud(xyz, f"KITTI velodyne scan, {_count(xyz)}", metres=((1.0, 1.0, 1.0), "metres"))
+    return PointFile(xyz, f"KITTI velodyne scan, {_count(xyz)}", metres=((1.0, 1.0, 1.0), "metres"))
 
 
-def _mesh(path: str | Path, kind: str) -> Cloud:
+def _mesh(path: str | Path, kind: str) -> PointFile:
     """Return the corners and triangles of a mesh, larger faces cut into triangles; of one without, its points."""
     import trimesh
 
@@ -266,8 +267,8 @@ def _mesh(path: str | Path, kind: str) -> Cloud:
         why = (" ".join(str(error).split()) or type(error).__name__)[:100]
         raise MapFileError(f"{path}: no mesh that can be read ({why}); export it again") from None
     if not len(faces):
-        return Cloud(xyz, f"{kind.upper()}, {_count(xyz)}")
-    return Cloud(xyz, f"{kind.upper()} mesh, surface of {len(faces):,} triangles", faces=faces)
+        return PointFile(xyz, f"{kind.upper()}, {_count(xyz)}")
+    return PointFile(xyz, f"{kind.upper()} mesh, surface of {len(faces):,} triangles", faces=faces)
 
 
 def _bytes(path: str | Path) -> bytes:

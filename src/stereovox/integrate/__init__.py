@@ -7,7 +7,9 @@ from typing import Protocol
 
 from stereovox import registry
 from stereovox.config import Config
-from stereovox.frame import DepthImage
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyImage, DepthImage
+from stereovox.integrate.points import Points
 from stereovox.maps.evidence import Evidence
 
 INTEGRATORS = {
@@ -37,6 +39,23 @@ class Integrator(Protocol):
         ...
 
 
+class Integration:
+    """Evidence of all kinds of images: depth images by the configured integrator, clouds by `Points`."""
+
+    def __init__(self, config: Config):
+        self._config, self._images = config, make_integrator(config)
+        self._clouds: Points | None = None
+
+    def evidence(self, image: AnyImage) -> Evidence:
+        """Return as `Integrator.evidence` and `Points.evidence`; FrameRefused `no_clouds` on graphics cards."""
+        if isinstance(image, DepthImage):
+            return self._images.evidence(image)
+        if self._config.device != "cpu":
+            raise FrameRefused("no_clouds", "clouds are mapped on the processor only; leave device=cuda out")
+        self._clouds = self._clouds or Points(self._config)
+        return self._clouds.evidence(image)
+
+
 def make_integrator(config: Config) -> Integrator:
-    """Return the configured integrator. Raises ConfigError for an unknown name."""
+    """Return the configured integrator of depth images. Raises ConfigError for an unknown name."""
     return registry.find("integrators", DEVICES[config.device], config.integrator)(config)

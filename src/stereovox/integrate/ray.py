@@ -69,7 +69,7 @@ class Ray:
         workers = len(shards(camera.height, config.threads))
         parts = [slice(n, camera.height, workers) for n in range(workers)]  # as many long rays for each
         in_shards(lambda part: self._follow(image, view, weight, eye, part), parts)
-        pool = self._merged(self._pools[:workers], weight is not None)
+        pool = merged(self._pools[:workers], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
@@ -104,13 +104,6 @@ class Ray:
             pool.clear()
             pool.reserve(2 * len(pool.coords))
 
-    def _merged(self, pools: list[BlockPool], adds: bool) -> BlockPool:
-        first, *others = pools
-        for other in others:
-            places = first.insert(other.coords[: len(other)])
-            _lanes.merge(first.values, other.values[: len(other)], places, adds)
-        return first
-
 
 class Line(Ray):
     """Evidence by line drawing: one cell in each layer along a ray's longest axis (Chien 2020, Alg 1).
@@ -119,6 +112,15 @@ class Line(Ray):
     """
 
     _kernel = staticmethod(_ray.draw)
+
+
+def merged(pools: list[BlockPool], adds: bool) -> BlockPool:
+    """Put the evidence of several threads into the first one's pool: sums (`adds`), or the strongest; return it."""
+    first, *others = pools
+    for other in others:
+        places = first.insert(other.coords[: len(other)])
+        _lanes.merge(first.values, other.values[: len(other)], places, adds)
+    return first
 
 
 class _Eye(NamedTuple):

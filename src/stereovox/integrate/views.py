@@ -10,6 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
@@ -40,7 +41,7 @@ MAX_BLOCKS = 1 << 21
 CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
 CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
 """(3, 512) centres of a block's cells from its corner, in cells."""
-Camera = TypeVar("Camera", bound=VirtualCamera)
+Camera = TypeVar("Camera", bound=VirtualCamera | Lidar)
 Tools = TypeVar("Tools")
 
 
@@ -127,8 +128,8 @@ class View(NamedTuple):
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
-def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> KernelTable:
-    """Return the kernel table of a sensor model for a camera with the configured noise."""
+def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCamera | Lidar) -> KernelTable:
+    """Return the kernel table of a sensor model for a camera with the configured noise, or a lidar with its own."""
     noise = RangeNoise.of(config.noise, camera)
     table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
     return kernel_table(table, config.max_range, config.blind)

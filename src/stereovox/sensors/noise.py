@@ -9,6 +9,7 @@ from math import radians
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import NoiseConfig
@@ -53,14 +54,17 @@ class RangeNoise:
         return self.s0 + self.s1 * z + self.s2 * z * z
 
     @classmethod
-    def of(cls, config: NoiseConfig, camera: VirtualCamera) -> RangeNoise:
-        """Return the configured noise; where s2 is not set, that of the camera's stereo geometry.
+    def of(cls, config: NoiseConfig, camera: VirtualCamera | Lidar) -> RangeNoise:
+        """Return that of a lidar, whatever is configured; of a camera the configured noise, and where s2 is not set,
+        that of its stereo geometry.
 
         s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square missing in print (Alg 3 has it), which
         is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
         in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
         the noise grows (`stereovox.depth.stereo.reproject`), which the thesis leaves out as well.
         """
+        if isinstance(camera, Lidar):
+            return cls(camera.sigma, 0.0, 0.0)
         if config.s2 is not None:
             return cls(config.s0, config.s1, config.s2)
         baseline = camera.baseline or config.default_baseline

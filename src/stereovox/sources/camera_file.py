@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
-from stereovox.frame import AnyFrame, Frame, StereoFrame
+from stereovox.frame import AnyFrame, Cloud, Frame, StereoFrame
 from stereovox.safe_io import is_number, read_table, shown, toml_text
 from stereovox.sources.base import Changed, Stream
 from stereovox.sources.intrinsics import NAMES, Intrinsics, read_camera_numbers, scaled
@@ -152,9 +152,11 @@ class WithCamera(Changed):
         self.camera, self.notes = camera, (*self.notes, *notes)
 
     def change(self, frame: AnyFrame) -> Frame:
-        """Return a depth frame with the camera; raises SourceError for a stereo pair."""
+        """Return a depth frame with the camera; raises SourceError for a stereo pair or a cloud."""
         if isinstance(frame, StereoFrame):
             raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
+        if isinstance(frame, Cloud):
+            raise SourceError(f"{self.name}: has clouds of a lidar, which no camera file fits; leave it out")
         return replace(frame, camera=self.camera)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Scan, StereoFrame, name_of
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.se3 import apart
 from stereovox.trust.history import (
     CHANGED,
@@ -110,7 +110,7 @@ class Gate:
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan, image: DepthImage | Scan) -> Passed:
+    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> Passed:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -158,7 +158,8 @@ class Gate:
         if len(frame.sensor) > MAX_NAME_LENGTH or not frame.sensor.isprintable():
             detail = f"sensor is not a printable name of at most {MAX_NAME_LENGTH} characters; rename it"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
-        return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
+        usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
+        return frame.sensor or usual, int(frame.stamp_ns)
 
     def _look(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Look | None:
         """Return the frame's image checksum. Raises FrameRefused for a repeated image although the camera has moved."""
@@ -168,7 +169,7 @@ class Gate:
         if before is None or before.digest != look.digest:
             return look
         metres, angle = apart(before.pose, now.pose)
-        if (metres > STILL_M or angle > STILL_RAD) and (isinstance(frame, StereoFrame) or _is_measured(frame.depth)):
+        if (metres > STILL_M or angle > STILL_RAD) and (not isinstance(frame, Frame) or _is_measured(frame.depth)):
             detail = f"the image is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the camera")
         return before
@@ -341,7 +342,10 @@ def _rows(image: np.ndarray) -> np.ndarray:
 
 def _digest(frame: AnyFrame) -> int:
     """Return a checksum of DIGEST_ROWS rows of the frame's images."""
-    images = (frame.left, frame.right) if isinstance(frame, StereoFrame) else (frame.depth,)
+    if isinstance(frame, StereoFrame):
+        images = frame.left, frame.right
+    else:
+        images = (frame.points if isinstance(frame, Cloud) else frame.depth,)
     number = 0
     for image in images:
         number = zlib.crc32(np.ascontiguousarray(_rows(image)).tobytes(), number)

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox import se3
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import StereoPair, VirtualCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import Frame, Scan, StereoFrame, name_of
+from stereovox.frame import Cloud, Frame, Scan, StereoFrame, name_of
 
 EXACT = 1e-14
 """Rigidity error of a rotation in float64 that cannot be improved."""
@@ -54,11 +55,17 @@ FIELDS = {
         "reason": ARRAY_OR_NONE._replace(reason="bad_reason"),
     },
     StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
+    Cloud: {
+        "points": ARRAY,
+        "lidar": Field((Lidar,), "a Lidar"),
+        "origins": ARRAY_OR_NONE,
+        "clear": ARRAY_OR_NONE,
+    },
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
 }
 """The other fields of each kind; a frame's `depth` is checked by `depth.prepare`, poses by `rigid_pose`."""
-MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Scan: ("ranges",)}
+MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Cloud: ("points",), Scan: ("ranges",)}
 """Fields that must not be masked arrays."""
 
 
@@ -66,8 +73,8 @@ def validate_fields(seen: Any, *kinds: type) -> None:
     """Raise FrameRefused for an object that is none of `kinds`, or that has a field of the wrong type.
 
     The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`; or the source's own
-    `fault`. kinds: out of Frame, StereoFrame and Scan. Array elements are not checked; masked arrays are refused, since
-    nothing downstream reads their mask.
+    `fault`. kinds: out of Frame, StereoFrame, Cloud and Scan. Array elements are not checked; masked arrays are
+    refused, since nothing downstream reads their mask.
     """
     for kind in kinds:
         if isinstance(seen, kind):
@@ -128,7 +135,7 @@ def validate_upright_scan(scan: Scan, config: Config) -> Scan:
     return scan
 
 
-def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
+def rigid_pose(frame: Frame | Cloud | Scan, tolerance: float) -> se3.Transform:
     """Return the rigid motion nearest to the pose; `tolerance` is the largest error that is rounded away.
 
     Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A lidar, or anything else that measures points one by one: what its ranges can be trusted for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import ClassVar
+
+from stereovox.errors import StereovoxError
+
+USUAL_SIGMA_M = 0.02
+"""Of common spinning lidars (Velodyne HDL-64E, VLP-16, Ouster OS1: 2 to 3 cm)."""
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """What the ranges of a lidar can be trusted for; the same for all of its clouds.
+
+    Attributes:
+        sigma: Standard deviation of a range in metres.
+        range_min: Metres below which a point is left out: the vehicle itself, or dirt on the window.
+        range_max: Metres beyond which a point is no surface; its ray is then free up to there.
+        baseline: None: a lidar has no stereo geometry.
+        width: 1, as `height`: what a lidar adds to caches that count the pixels of cameras.
+        height: 1.
+
+    Raises:
+        StereovoxError: A number is out of range.
+    """
+
+    sigma: float = USUAL_SIGMA_M
+    range_min: float = 0.5
+    range_max: float = inf
+    baseline: ClassVar[float | None] = None
+    width: ClassVar[int] = 1
+    height: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sigma < inf:
+            raise StereovoxError(f"lidar: sigma {self.sigma:g} must be more than 0 metres")
+        if not 0 <= self.range_min < self.range_max:
+            raise StereovoxError(
+                f"lidar: ranges from {self.range_min:g} to {self.range_max:g} m; they must rise, from 0 on"
+            )

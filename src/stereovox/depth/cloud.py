@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check clouds, and straighten those of a sensor that moved while it measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import CheckedCloud, Cloud, name_of
+from stereovox.se3 import Transform, inverse
+from stereovox.trust.validate import rigid_pose, validate_fields
+
+MAX_POINTS = 1 << 23
+"""Points of one cloud that are taken."""
+STEPS = 64
+"""Poses of a moving sensor during one cloud: between them it moves a few centimetres at most."""
+
+
+def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
+    """Return the rays of a cloud that say something.
+
+    Points without value, and those nearer than the lidar's or the settings' minimum range, are left out: their rays
+    clear nothing. Rays beyond the lidar's own maximum range end there, with no surface.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_shape`,
+    `too_many_points`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_point`.
+    """
+    validate_fields(cloud, Cloud)
+    T = rigid_pose(cloud, config.pose_rigidity_tolerance)
+    points, clear = _points(cloud, "points"), _points(cloud, "clear")
+    origins = None if cloud.origins is None else _points(cloud, "origins")
+    if origins is not None and len(origins) != len(points):
+        detail = f"{len(origins)} origins of {len(points)} points; give one for each"
+        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
+    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
+    if origins is not None:
+        measured &= np.isfinite(origins).all(axis=1)
+    clear = clear[np.isfinite(clear).all(axis=1)]
+    ends, starts = points[measured], None if origins is None else origins[measured]
+    length = np.linalg.norm(ends if starts is None else ends - starts, axis=1)
+    far = length > cloud.lidar.range_max
+    if far.any():
+        start = 0.0 if starts is None else starts[far]
+        ends[far] = start + (ends[far] - start) * (cloud.lidar.range_max / length[far])[:, None]
+    used = length >= max(cloud.lidar.range_min, config.min_range)
+    if not used.any() and not len(clear):
+        found = f"{len(points)} points, {measured.sum()} of them finite"
+        raise FrameRefused("no_valid_point", f"{name_of(cloud)}: not one ray can be used ({found}); is it covered?")
+    if len(clear) and starts is not None:
+        starts = np.concatenate([starts[used], np.zeros((len(clear), 3))])
+    elif starts is not None:
+        starts = starts[used]
+    hits = np.concatenate([~far[used], np.zeros(len(clear), bool)])
+    return CheckedCloud(np.concatenate([ends[used], clear]), starts, hits, cloud.lidar, T, int(cloud.stamp_ns))
+
+
+def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transform]) -> Cloud:
+    """Return a cloud as it had been measured at once, at its stamp, from where its sensor really was.
+
+    Args:
+        cloud: Its points are where the sensor saw them when it measured each.
+        times_s: (N,) seconds from `stamp_ns` at which each was measured.
+        pose_at: Returns T_world_sensor (4, 4) at a time in nanoseconds; FrameRefused where it is not known.
+
+    Returns:
+        The cloud with its points in the sensor's frame at `stamp_ns`, and with `origins`. Points with a time that is
+        not finite are then not finite.
+
+    Raises:
+        FrameRefused: The pose at some time of the sweep is not known, or there is not one time for each point.
+    """
+    times = np.asarray(times_s, float)
+    if times.shape != (len(cloud.points),):
+        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {times.shape} times of {len(cloud.points)} points")
+    known = np.isfinite(times)
+    if not known.any():
+        return replace(cloud, points=np.full((len(times), 3), np.nan))
+    first, last = float(times[known].min()), float(times[known].max())
+    knots = np.linspace(first, last, STEPS) if last > first else np.array([first])
+    T_now_world = inverse(cloud.T_world_sensor)
+    moved = np.array([T_now_world @ pose_at(cloud.stamp_ns + round(1e9 * knot)) for knot in knots])
+    step = (last - first) / max(len(knots) - 1, 1) or 1.0
+    number = np.clip(np.rint((np.where(known, times, first) - first) / step).astype(np.int64), 0, len(knots) - 1)
+    R, origins = moved[number, :3, :3], moved[number, :3, 3]
+    points = np.einsum("nij,nj->ni", R, np.asarray(cloud.points, float)) + origins
+    points[~known | ~np.asarray(cloud.points).any(axis=1)] = np.nan
+    return replace(cloud, points=points, origins=origins)
+
+
+def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
+    """Return points (N, 3) of a field as float64; none where it is None."""
+    given = getattr(cloud, field)
+    if given is None:
+        return np.empty((0, 3))
+    if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind != "f":
+        detail = f"{field} are {given.shape} {given.dtype}; give (N, 3) float32 metres"
+        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
+    if len(given) > MAX_POINTS:
+        raise FrameRefused("too_many_points", f"{name_of(cloud)}: {len(given)} {field}; at most {MAX_POINTS} are taken")
+    return given.astype(float)

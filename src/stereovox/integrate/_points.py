@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel of rays that end at single points: ray casting (Amanatides and Woo 1987) with a direction for each lane."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox._math import floor
+from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of, pack, table_row
+from stereovox.integrate._lanes import (
+    HALF_DIAGONAL,
+    LANES,
+    aim_at_hits,
+    even_to,
+    evidence,
+    free_space,
+    give,
+)
+from stereovox.integrate._ray import _first, _inverse, _step
+
+
+@kernel
+def cast(rays, runs, places, view, table, look_up, lanes, memory, pool_table, coords, count, values, first, step):
+    """Add the evidence of rays to an empty pool, the strongest in each cell; return False when it is too small.
+
+    rays: (5, N) direction in cells a metre, metres to the surface (NO_RETURN: none), metres to the ray's end where
+    there is none. runs: (K, 3) rays from, to, of one place and one sign along each axis; and that place's number.
+    places: (P, 3) in cells from the corner of the block they count from. first, step: every `step`-th run.
+    """
+    memory.block[:] = -1
+    even = even_to(table, view)
+    for k in range(first, runs.shape[0], step):
+        start, stop, p = runs[k, 0], runs[k, 1], runs[k, 2]
+        position = places[p, 0], places[p, 1], places[p, 2]
+        signs = _sign(rays[0, start]), _sign(rays[1, start]), _sign(rays[2, start])
+        free_to = _aim(rays[:, start:stop], position, signs, view, table, lanes)
+        if free_to >= NO_RETURN:
+            continue
+        reached, going = ZERO, True
+        while going:
+            tableless = reached < min(free_to, even)
+            reached, going, starts = _step(lanes, position, signs)
+            if tableless:
+                total, unlike = free_space(lanes, table, None)
+            else:
+                total, unlike = evidence(lanes, look_up, table, None)
+            if not give(lanes, starts | unlike, total, None, memory, pool_table, coords, count, values):
+                return False
+        starts, total = aim_at_hits(lanes, table, None)
+        if not give(lanes, starts, total, None, memory, pool_table, coords, count, values):
+            return False
+    return True
+
+
+@cell
+def _sign(direction):
+    return ONE if direction >= ZERO else -ONE
+
+
+@cell
+def _aim(rays, position, signs, view, table, lanes):
+    """Fill the lanes for a run of rays, in the first cell they cross; those left over go along with the last ray, and
+    end at once.
+
+    Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
+    """
+    x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
+    key = pack(np.int32(x), np.int32(y), np.int32(z), lanes.cell)
+    x, y, z = x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
+    half_cell, nearest = HALF_DIAGONAL * view.voxel_size, bits_of(NO_RETURN)
+    n = rays.shape[1]
+    for i in range(LANES):
+        j = min(i, n - 1)
+        dx, dy, dz, d, clear = rays[0, j], rays[1, j], rays[2, j], rays[3, j], rays[4, j]
+        real = d < NO_RETURN
+        row = table_row(min(d, view.max_range), table.rows_per_metre, table.hit.size)
+        reach = table.reach[row]
+        end = (d + (reach if table.marks else ZERO)) if real else clear
+        lanes.depth[i], lanes.row[i], lanes.end[i] = d, row, end if i < n else -ONE
+        lanes.columns[i], lanes.reach[i] = table.columns_per_metre[row], reach
+        lanes.entered[i], lanes.cell[i] = ZERO, key
+        lanes.x[i], lanes.y[i], lanes.z[i] = x, y, z
+        lanes.per_x[i], lanes.per_y[i], lanes.per_z[i] = _inverse(dx), _inverse(dy), _inverse(dz)
+        point = d if real else ZERO
+        hit = pack(
+            np.int32(floor(position[0] + point * dx)),
+            np.int32(floor(position[1] + point * dy)),
+            np.int32(floor(position[2] + point * dz)),
+            lanes.hit,
+        )
+        lanes.hit[i] = hit if real & (i < n) else lanes.hit.dtype.type(-1)
+        plain = (d - max(reach, half_cell)) if real else clear
+        nearest = min(nearest, bits_of(max(plain, ZERO) if i < n else NO_RETURN))
+    free_to = float_of(nearest)
+    return free_to if free_to >= NO_RETURN else free_to - half_cell

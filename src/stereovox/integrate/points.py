@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence of clouds: every ray is followed by itself, from where the sensor was to its point."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.lidar import Lidar
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import CheckedCloud
+from stereovox.integrate import _cells, _lanes, _points
+from stereovox.integrate._cells import NO_RETURN
+from stereovox.integrate._lanes import LANES
+from stereovox.integrate.ray import make_lanes, make_memory, merged
+from stereovox.integrate.views import MAX_BLOCKS, KernelTable, PerCamera, origin_block, sensor_table
+from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.evidence import Evidence
+from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
+from stereovox.threads import in_shards
+
+PLACES = 16
+"""Places along a cell's side at which rays begin: those of a moving sensor are rounded to them."""
+
+
+class _View(NamedTuple):
+    voxel_size: np.float32
+    max_range: np.float32
+
+
+class _Tools(NamedTuple):
+    """Tools of one lidar: its sensor table, and the same with both signs together."""
+
+    table: KernelTable
+    look_up: NDArray[np.int32]
+
+
+class Points:
+    """Evidence of clouds by ray casting (Amanatides and Woo 1987), the strongest in each cell, as OctoMap does.
+
+    A cell that holds a point is a hit, whatever other rays pass it; a cell that is only passed counts once for the
+    cloud. Rays end at `max_range`; one whose point lies beyond is free as far as its noise allows.
+    """
+
+    def __init__(self, config: Config):
+        sensor = make_sensor(config.sensor)
+        self._config = config
+        self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
+        self._tools = PerCamera(partial(_tools, sensor, config))
+        self._scratch: dict[tuple[bool, int], tuple] = {}
+
+    def evidence(self, cloud: CheckedCloud) -> Evidence:
+        """Return the evidence of a checked cloud; its memory is reused by the next call.
+
+        Raises FrameRefused `view_too_large` where it is on more cells than can be counted.
+        """
+        config, tools = self._config, self._tools[cloud.lidar]
+        rays, runs, places = self._laid_out(cloud, tools.table)
+        wide, workers = self._is_wide(tools.table, places), min(config.threads, max(len(runs), 1))
+        view = _View(np.float32(config.voxel_size), np.float32(config.max_range))
+        scratch = [self._scratch_of(wide, n) for n in range(workers)]
+
+        def follow(part: slice) -> None:
+            n = part.start
+            pool = self._pools[n]
+            pool.clear()
+            while not _points.cast(
+                rays, runs, places, view, *tools, *scratch[n], pool.table, pool.coords, pool.count, pool.values,
+                n, workers,
+            ):  # fmt: skip
+                if 2 * len(pool.coords) > MAX_BLOCKS:
+                    raise FrameRefused(
+                        "view_too_large",
+                        f"the cloud has evidence on more than {CELLS * MAX_BLOCKS:.2g} cells: lower max_range, or use "
+                        "larger cells",
+                    )
+                pool.clear()
+                pool.reserve(2 * len(pool.coords))
+
+        in_shards(follow, [slice(n, None) for n in range(workers)])
+        pool = merged(self._pools[:workers], adds=False)
+        values = np.empty((len(pool), CELLS), np.int16)
+        _lanes.to_thousandths(pool.values[: len(pool)], 0, values)
+        origin = origin_block(cloud.T_world_sensor, config).astype(np.int32)
+        return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), np.empty(0, np.int16))
+
+    def _laid_out(
+        self, cloud: CheckedCloud, table: KernelTable
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
+        """Return the rays of a cloud, runs of them that go from one place the same way, and the places."""
+        config, cell = self._config, np.array(self._config.cell)
+        R, corner = cloud.T_world_sensor[:3, :3], origin_block(cloud.T_world_sensor, config) * (SIDE * cell)
+        ends = (cloud.ends @ R.T + (cloud.T_world_sensor[:3, 3] - corner)) / cell
+        places, of_place = self._places(cloud, R, corner, cell)
+        steps = ends - places[of_place]
+        length = np.linalg.norm(steps * cell, axis=1)
+        surface, clear = self._ends(cloud, length, float(table.reach[-1]))
+        used = (length > 0) & ((surface < NO_RETURN) | (clear > 0))
+        steps, length, of_place = steps[used] / length[used, None], length[used], of_place[used]
+        way = (steps >= 0) @ np.array([4, 2, 1]) + 8 * of_place
+        order = np.argsort(way, kind="stable")
+        rays = np.ascontiguousarray(np.column_stack([steps, surface[used], clear[used]])[order].T, np.float32)
+        return rays, _runs(way[order]), np.ascontiguousarray(places, np.float32)
+
+    def _places(
+        self, cloud: CheckedCloud, R: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the places (P, 3) in cells at which rays begin, and which of them each does (N,)."""
+        t = cloud.T_world_sensor[:3, 3] - corner
+        if cloud.origins is None:
+            return t[None] / cell, np.zeros(len(cloud.ends), np.int64)
+        starts = np.rint((cloud.origins @ R.T + t) / cell * PLACES) / PLACES
+        places, of_place = np.unique(starts, axis=0, return_inverse=True)
+        return places, of_place.reshape(-1)
+
+    def _ends(
+        self, cloud: CheckedCloud, length: NDArray[np.float64], reach: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how far away the surface of each ray is (NO_RETURN: there is none), and how far it is free then."""
+        max_range = self._config.max_range
+        hits = cloud.hits & (length <= max_range)
+        free = np.where(cloud.hits, length - reach, length)
+        return np.where(hits, length, float(NO_RETURN)), np.clip(free, 0, max_range)
+
+    def _is_wide(self, table: KernelTable, places: NDArray[np.float32]) -> bool:
+        """Return whether cells need keys of 64 bits. Raises FrameRefused where these do not suffice either."""
+        config = self._config
+        beyond = float(table.reach[-1]) if table.marks else 0.0
+        far = (config.max_range + beyond) / min(config.cell) + SIDE + float(np.abs(places).max(initial=0))
+        if far >= 1 << (_cells.WIDE - 1):
+            raise FrameRefused(
+                "view_too_large", f"the cloud reaches {far:.2g} cells far: lower max_range, or use larger cells"
+            )
+        return far >= 1 << (_cells.NARROW - 1)
+
+    def _scratch_of(self, wide: bool, n: int) -> tuple:
+        if (wide, n) not in self._scratch:
+            self._scratch[wide, n] = make_lanes(wide), make_memory()
+        return self._scratch[wide, n]
+
+
+def _tools(sensor: InverseSensorModel, config: Config, lidar: Lidar) -> _Tools:
+    table = sensor_table(sensor, config, lidar)
+    return _Tools(table, (table.clear + table.mark).ravel())
+
+
+def _runs(way: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return runs (K, 3) of at most LANES rays with the same way, of ascending ways (N,): from, to, place."""
+    edges = np.flatnonzero(np.diff(way, prepend=-1, append=-1))
+    runs = [
+        np.column_stack([starts, np.minimum(starts + LANES, stop), np.full(len(starts), way[start] >> 3)])
+        for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+        for starts in (np.arange(start, stop, LANES),)
+    ]
+    return np.concatenate([np.empty((0, 3), np.int64), *runs]).astype(np.int32)

@@ -38,6 +38,8 @@ SOURCES = {
     "rig": "stereovox.sources.rig:StereoRig",
     "asl": "stereovox.sources.asl:AslRig",
     "two_view": "stereovox.sources.two_view:TwoView",
+    "velodyne": "stereovox.sources.clouds.velodyne:Velodyne",  # before KITTI's images, which are in the same folders
+    "camera_and_velodyne": "stereovox.sources.clouds.velodyne:CameraAndVelodyne",
     "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
     "kitti_tracking": "stereovox.sources.kitti.tracking:KittiTracking",
     "kitti_odometry": "stereovox.sources.kitti.odometry:KittiOdometry",
@@ -45,6 +47,7 @@ SOURCES = {
     "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.simulate.simulation:Simulation",
     "rtabmap_db": "stereovox.sources.rgbd.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
+    "bag_clouds": "stereovox.sources.clouds.bag:BagClouds",  # before the depth images of the same bag
     "bag": "stereovox.sources.bags.recording:Bag",
     "sens": "stereovox.sources.rgbd.packed:SensFile",
     "klg": "stereovox.sources.rgbd.klg:KlgLog",
@@ -58,6 +61,7 @@ SOURCES = {
     "polycam": "stereovox.sources.rgbd.polycam:Polycam",
     "record3d": "stereovox.sources.rgbd.record3d:Record3D",
     "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
+    "clouds": "stereovox.sources.clouds.folder:CloudFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, Frame, StereoFrame
+from stereovox.frame import AnyFrame, Cloud, Frame, StereoFrame
 from stereovox.products.floor_axes import nearest_axis, up_of, upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.se3 import Transform, inverse, rigidity_error, rotation_vector
 from stereovox.sources.base import Source, Stream
 from stereovox.track.tracker import LEVEL as AHEAD
 
+KINDS = {StereoFrame: "stereo", Frame: "depth", Cloud: "cloud"}
+"""What a recording consists of, by the type of its frames."""
 RIGID = 0.05
 """Largest entry of abs(R^T R - I) of a pose that is used here."""
 FRAMES = 16
@@ -83,7 +85,7 @@ class Survey:
 
     Attributes:
         name: Name of the recording.
-        kind: `depth` or `stereo`.
+        kind: `depth`, `stereo` or `cloud`.
         frames: Number of frames.
         seconds: Time from the first to the last frame; 0 where the recording has no times.
         camera: Camera of all frames.
@@ -202,7 +204,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     read = [source.frame(i) for i in numbers]
     posed = [frame for frame in read if _has_pose(frame)]
     images = [frame for frame in read if isinstance(frame, Frame) and frame.depth.size]
-    depths = [_depth_m(frame) for frame in images]
+    depths = [_depth_m(frame) for frame in images] + [_ranges(frame) for frame in read if isinstance(frame, Cloud)]
     valid = np.concatenate([np.empty(0), *(depth[np.isfinite(depth)] for depth in depths)])
     pixels = sum(depth.size for depth in depths)
     max_range = suggest_range(valid, source.camera, stereo=isinstance(read[0], StereoFrame))
@@ -210,7 +212,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     unit = getattr(source, "unit", None)
     return Survey(
         name=source.name,
-        kind="stereo" if isinstance(read[0], StereoFrame) else "depth",
+        kind=KINDS[type(read[0])],
         frames=len(source),
         seconds=(read[-1].stamp_ns - read[0].stamp_ns) / 1e9,
         camera=source.camera,
@@ -252,7 +254,7 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     if gravity is not None:
         axis, off = _axis_near(gravity)
         return Up(axis, gravity, off, True, "by the accelerometer")
-    mean = np.mean([-frame.T_world_sensor[:3, 1] for frame in frames], axis=0)
+    mean = np.mean([_own_up(frame) for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:
         axis = nearest_axis(mean) if steady > 0 else "z"
@@ -354,6 +356,17 @@ def suggest_cell(depths: NDArray[np.float64], max_range: float) -> Suggestion:
 
 def _has_pose(frame: AnyFrame) -> bool:
     return not frame.fault and rigidity_error(frame.T_world_sensor) < RIGID
+
+
+def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
+    """Return the direction (3,) in the world that is up where a sensor stands upright: lidars have other axes."""
+    return frame.T_world_sensor[:3, 2] if isinstance(frame, Cloud) else -frame.T_world_sensor[:3, 1]
+
+
+def _ranges(cloud: Cloud) -> NDArray[np.float64]:
+    """Return a sample of a cloud's ranges in metres, NaN where there is none."""
+    ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
+    return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
 
 
 def _depth_m(frame: Frame) -> NDArray[np.float64]:

@@ -22,6 +22,8 @@ from stereovox.track.stream import POSE_FAULTS
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
+IN_WORDS = {"depth": "depth image", "stereo": "stereo pair", "cloud": "cloud"}
+"""What recordings consist of."""
 MAX_RATE_HZ = 2000.0
 """Frames a second beyond which the stamps of a recording are wrong."""
 MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/PointCloud2")
@@ -111,15 +113,18 @@ def survey_facts(found: Survey) -> dict[str, Any]:
 
 
 def _survey_lines(found: Survey) -> list[str]:
-    camera, images = found.camera, many(found.frames, "depth image" if found.kind == "depth" else "stereo pair")
+    camera, frames = found.camera, many(found.frames, IN_WORDS[found.kind])
     when = "" if found.rate_hz is None else f", {found.seconds:.1f} s{_rate(found.rate_hz)}"
     if found.rate_hz is not None and found.rate_hz > MAX_RATE_HZ:
         when = f", whose stamps span {found.seconds:.3f} s, which cannot be right"
-    lines = [f"{found.name}: {images} of {camera.width}x{camera.height}{when}"]
     baseline = "unknown" if camera.baseline is None else f"{camera.baseline:.4g} m"
-    lines.append(
+    about = (
         f"camera: fx {camera.fx:.5g}, fy {camera.fy:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}, baseline {baseline}"
     )
+    if found.kind == "cloud":
+        lines = [f"{found.name}: {frames}{when}"]
+    else:
+        lines = [f"{found.name}: {frames} of {camera.width}x{camera.height}{when}", about]
     if found.unit is not None:
         noted = any(found.unit_why in note for note in found.notes)
         why = "" if noted else f" ({found.unit_why})"
@@ -128,7 +133,7 @@ def _survey_lines(found: Survey) -> list[str]:
         near, middle, far = found.depth_m
         lines.append(
             f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half of them below {middle:.2f} m; "
-            f"{100 * found.without_value:.0f} % of the pixels have no depth"
+            f"{100 * found.without_value:.0f} % of the {'points' if found.kind == 'cloud' else 'pixels'} have none"
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():

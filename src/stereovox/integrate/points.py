@@ -94,7 +94,8 @@ class Points:
     ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
         """Return the rays of a cloud, runs of them that go from one place the same way, and the places."""
         config, cell = self._config, np.array(self._config.cell)
-        R, corner = cloud.T_world_sensor[:3, :3], origin_block(cloud.T_world_sensor, config) * (SIDE * cell)
+        R, block = cloud.T_world_sensor[:3, :3], origin_block(cloud.T_world_sensor, config)
+        corner = block.astype(float) * SIDE * cell
         ends = (cloud.ends @ R.T + (cloud.T_world_sensor[:3, 3] - corner)) / cell
         places, of_place = self._places(cloud, R, corner, cell)
         steps = ends - places[of_place]

@@ -97,7 +97,9 @@ def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
         raise SourceError(f"{file.path}: several topics with depth, say which: ?depth={' or ?depth='.join(found)}")
     if not found:
         seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
-        raise SourceError(f"{file.path}: no depth images ({', '.join(DEPTH)} or {PACKED}) in it; it holds {seen}")
+        clouds = [f"?cloud={name}" for name, kind in sorted(file.types.items()) if kind == "sensor_msgs/PointCloud2"]
+        cure = f"; for its clouds add {' or '.join(clouds)}" if clouds else ""
+        raise SourceError(f"{file.path}: no depth images ({', '.join(DEPTH)} or {PACKED}) in it; it holds {seen}{cure}")
     return DepthTopic(file, found[0], info)
 
 

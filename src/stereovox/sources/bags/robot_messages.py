@@ -23,6 +23,11 @@ LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointC
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 FLOATS = {7: "f4", 8: "f8"}
 """`sensor_msgs/PointField` types that can hold a coordinate."""
+NUMBERS = {5: "i4", 6: "u4", **FLOATS}
+POINT_TIMES = ("time", "t", "timestamp", "offset_time", "time_stamp")
+"""Fields with the time of each point: Velodyne's, Ouster's, Hesai's, Livox's, and others'."""
+CLOCK_FROM, NANOSECONDS_FROM = 1e6, 1e15
+"""Numbers from which a time is one of a clock, in seconds and in nanoseconds."""
 MAX_FIELDS = 256
 MAX_BEAMS = 100_000
 LARGEST = 1e9
@@ -82,16 +87,21 @@ def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: floa
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point there."""
+    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point there.
+
+    times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None where the cloud does not say.
+    """
 
     stamp_ns: int
     frame_id: str
     points: NDArray[np.float32]
+    times_s: NDArray[np.float64] | None = None
 
 
 def read_point_cloud(wire: Wire) -> PointCloud:
     """Return a `sensor_msgs/PointCloud2`: its fields x, y and z, wherever they stand, as 4 or 8 byte floats.
 
+    Times of points: the first field of `POINT_TIMES` there is.
     Raises ValueError for a cloud without them, of a size that its data does not have, or of points that overlap.
     """
     stamp_ns, frame_id = wire.header()
@@ -115,16 +125,35 @@ def read_point_cloud(wire: Wire) -> PointCloud:
             f"points of {end} bytes do not fit: point_step {point_step}, row_step {row_step}, {width} wide"
         )
     _check_size(height, width, point_step, row_step, len(data))
-    columns = (
-        [
-            np.ndarray((height, width), dtype, data, offset, (row_step, point_step)).ravel()
-            for dtype, offset in zip(types, offsets, strict=True)
-        ]
-        if height * width
-        else [np.empty(0)] * 3
-    )
+
+    def column(dtype: np.dtype, offset: int) -> NDArray[np.generic]:
+        if not height * width:
+            return np.empty(0, dtype)
+        return np.ndarray((height, width), dtype, data, offset, (row_step, point_step)).ravel()
+
+    columns = [column(dtype, offset) for dtype, offset in zip(types, offsets, strict=True)]
+    times = None
+    for name in POINT_TIMES:
+        offset, kind = fields.get(name, (0, 0))
+        dtype = np.dtype(f"{order}{NUMBERS[kind]}") if kind in NUMBERS else None
+        if dtype is not None and offset + dtype.itemsize <= point_step:
+            times = _seconds(column(dtype, offset), stamp_ns)
+            break
     with np.errstate(over="ignore", invalid="ignore"):
-        return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32))
+        return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32), times)
+
+
+def _seconds(given: NDArray[np.generic], stamp_ns: int) -> NDArray[np.float64]:
+    """Return times of points in seconds from their cloud's stamp: whole numbers are nanoseconds, others seconds; those
+    of a clock, not of the sweep, are so large that they say so themselves.
+    """
+    if given.dtype.kind in "iu":
+        return 1e-9 * given.astype(np.float64)
+    times = given.astype(np.float64)
+    largest = float(np.abs(times[np.isfinite(times)]).max(initial=0.0))
+    if largest > NANOSECONDS_FROM:  # nanoseconds since 1970
+        return 1e-9 * (times - stamp_ns)
+    return times - 1e-9 * stamp_ns if largest > CLOCK_FROM else times
 
 
 @dataclass(frozen=True)

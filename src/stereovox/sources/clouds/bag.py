@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds and 2-D scans of bags: `drive.bag?cloud=/velodyne_points`, `drive.bag?scan=/scan`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.depth.cloud import deskewed
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Cloud
+from stereovox.sources.bags import open_bag, suffix_of
+from stereovox.sources.bags.recording import Options as PoseOptions
+from stereovox.sources.bags.recording import TurnedTf, file_part, read_poses
+from stereovox.sources.bags.robot_messages import LASER_SCAN, POINT_CLOUD, LaserScan, PointCloud
+from stereovox.sources.bags.scans import ScanTopic, check_topic
+from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
+
+TOPICS = {"cloud": POINT_CLOUD, "scan": LASER_SCAN}
+
+
+@dataclass(frozen=True)
+class Options(LidarOptions):
+    """Options of `LidarOptions`, and:
+
+    cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) in place of
+    these. poses: topic of the poses of the lidar; without it those of /tf. world_frame: as for depth images. deskew: 0
+    to take the points of a cloud as measured at once, though they have times.
+    """
+
+    cloud: str = ""
+    scan: str = ""
+    poses: str = ""
+    world_frame: str = ""
+    deskew: bool = True
+
+
+class BagClouds(CloudSource):
+    """Clouds, or 2-D scans, of one topic of a bag, with the poses that /tf or another topic tells.
+
+    where: the file, with `?cloud=/topic` or `?scan=/topic`; see `Options`.
+    Points: fields x, y and z. Where they have times (`time`, `t`, `timestamp`, `offset_time`) they are straightened by
+        the poses of the sensor (`deskewed`). Of a scan: each beam's end; beams without an echo (+inf) are free up to
+        its `range_max`.
+    Pose: of the frame that the messages name, at their times.
+    Faults: `unreadable`, `no_pose`, `bad_pose_file`.
+    Raises SourceError for files that cannot be used, topics that do not exist or hold something else, and bad options.
+    """
+
+    layout = "clouds of a bag (drive.bag?cloud=/topic) or its 2-D scans (?scan=/topic)"
+
+    def __init__(self, where: str):
+        path = file_part(where)
+        self._options, others = options_of(where, len(path), Options)
+        no_others(where, others, Options)
+        given = {key: topic for key in TOPICS if (topic := getattr(self._options, key))}
+        if len(given) != 1:
+            raise SourceError(f"{where}: says {' and '.join(given)}; give one of ?cloud= and ?scan=")
+        ((key, topic),) = given.items()
+        self._file = open_bag(Path(path))
+        check_topic(self._file, topic, (TOPICS[key],), key)
+        self._scans = ScanTopic(self._file, topic, self._options.range_max)
+        self.name, self.lidar = f"{Path(path).name} {topic}", self._options.lidar
+        options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame, axes="optical")
+        self._poses, self._missing, notes = read_poses(self._file, options, self._scans.frame_id)
+        self.notes = (*self._file.notes, *notes, *self._note_of_times())
+        self.posed = self._poses is not None
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether `where` is a bag of which clouds or scans are asked for."""
+        file = file_part(where)
+        asked = [word.partition("=")[0] for word in where[len(file) :].lstrip("?").split("&")]
+        return bool(set(asked) & set(TOPICS)) and bool(suffix_of(file))
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def stamp_ns(self, i: int) -> int:
+        """Return the time at which cloud `i` was recorded."""
+        return self._scans.recorded_ns(i)
+
+    def file(self, i: int) -> str:
+        """Return its message."""
+        return self._scans.name(i)
+
+    def cloud(self, i: int) -> Cloud:
+        """Return cloud `i`, straightened where its points have times."""
+        message = self._scans.read(i)
+        T = self._pose_at(message.stamp_ns)
+        if isinstance(message, LaserScan):
+            found = cloud_of_scan(message, self._options)
+        else:
+            found = Cloud(message.points, T, lidar=self.lidar)
+        found = replace(
+            found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic,
+            pose_off_ns=self._off_ns(message.stamp_ns),
+        )  # fmt: skip
+        times = message.times_s if isinstance(message, PointCloud) and self._options.deskew else None
+        return found if times is None else deskewed(found, times, self._pose_at)
+
+    def _pose_at(self, stamp_ns: int) -> np.ndarray:
+        if self._poses is None:
+            raise FrameRefused("no_pose", self._missing)
+        return self._poses.at(stamp_ns)
+
+    def _off_ns(self, stamp_ns: int) -> int:
+        return self._poses.poses.off_ns(stamp_ns) if isinstance(self._poses, TurnedTf) else 0
+
+    def _note_of_times(self) -> tuple[str, ...]:
+        """Return a note where clouds are taken as measured at once, though nothing says so."""
+        if not self._scans.is_cloud or not len(self._scans):
+            return ()
+        try:
+            message = self._scans.read(0)
+        except FrameRefused:
+            return ()
+        if isinstance(message, PointCloud) and message.times_s is None:
+            return (f"{self.name}: its points have no times, so each cloud counts as measured at once",)
+        return ()
+
+
+def cloud_of_scan(scan: LaserScan, options: LidarOptions | None = None) -> Cloud:
+    """Return a 2-D scan as a cloud in its own plane, without a pose.
+
+    Args:
+        scan: The scan; +inf is nothing up to `range_max`.
+        options: Say how exact its ranges are.
+    """
+    angles = scan.angle_min + scan.angle_step * np.arange(len(scan.ranges))
+    directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    hit, free = np.isfinite(scan.ranges), scan.ranges == inf
+    lidar = replace((options or LidarOptions()).lidar, range_min=scan.range_min, range_max=scan.range_max)
+    return Cloud(
+        directions[hit] * scan.ranges[hit, None].astype(float), np.full((4, 4), np.nan), scan.stamp_ns, lidar,
+        clear=directions[free] * scan.range_max,
+    )  # fmt: skip

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders with one file for each cloud, and a file of poses."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, MapFileError, NoPoses, SourceError, did_you_mean
+from stereovox.frame import Cloud
+from stereovox.sources.base import Part
+from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
+from stereovox.sources.images import file_names
+from stereovox.sources.lidar import read_velodyne
+from stereovox.sources.parameters import file_of
+from stereovox.sources.point_files import read_points
+from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rig_options import poses_of_images
+from stereovox.sources.tracker import AXES
+from stereovox.sources.trajectory import ns_from_seconds
+
+ENDINGS = (".pcd", ".ply", ".bin")
+SUBFOLDERS = ("", "clouds", "scans", "velodyne", "velodyne_points/data", "lidar", "pcd", "ply", "points")
+POSE_FILES = ("poses.txt", "poses.tum", "groundtruth.txt", "trajectory.txt", "trajectory.tum", "poses.csv")
+TIMES = ("times.txt", "timestamps.txt")
+NANOSECONDS = re.compile(r"\d{16,19}")
+SECONDS = re.compile(r"\d{1,10}\.\d+")
+RATE_HZ = 10.0
+"""Clouds a second where nothing says when they were taken: that of most spinning lidars."""
+
+
+@dataclass(frozen=True)
+class Options(LidarOptions):
+    """Options of `LidarOptions`, and:
+
+    poses: file of the poses, of any form (see `rgbd.pose_files`), in place of the folder's own. axes: those of the
+    posed body where it is not the lidar's (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds a
+    second, where they have no times.
+    """
+
+    poses: str = ""
+    axes: str = ""
+    fps: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.axes and self.axes not in AXES:
+            raise SourceError(f"axes={self.axes} is unknown{did_you_mean(self.axes, AXES)}")
+        if self.fps < 0:
+            raise SourceError(f"fps={self.fps:g} must be positive")
+
+
+class CloudFolder(CloudSource):
+    """Clouds in `.pcd`, `.ply` or KITTI's `.bin` files, with the poses of the lidar.
+
+    where: the folder, with the files in it or in one of `clouds`, `scans`, `velodyne`, `lidar`, `pcd`, `ply`, `points`;
+        see `Options` for what may follow.
+    Poses: `poses.txt` or the like, T_world_lidar in any form; interpolated where they have times, else one for each
+        cloud.
+    Times: of the files' names, where these are seconds with a fraction or nanoseconds; else lines of seconds in
+        `times.txt`; else 10 clouds a second, which a note tells.
+    Faults: `unreadable`, `no_pose`, `bad_pose_file`.
+    Raises SourceError where there is no cloud, or what is said of times and poses does not fit.
+    """
+
+    layout = "a folder of clouds (.pcd, .ply, .bin) with poses of the lidar (poses.txt)"
+    parts = (
+        Part(("*.pcd", "*.ply", "*/*.pcd", "*/*.ply", "*/*.bin"), "clouds (.pcd, .ply, .bin)"),
+        Part(POSE_FILES, "poses of the lidar (poses.txt)"),
+    )
+
+    def __init__(self, where: str):
+        folder = Path(folder_part(where))
+        options, others = options_of(where, len(str(folder_part(where))), Options)
+        no_others(where, others, Options)
+        self.name, self.lidar, self.notes = folder.resolve().name, options.lidar, ()
+        self._files = _clouds_in(folder)
+        if not self._files:
+            raise SourceError(f"{folder}: has no clouds ({', '.join(ENDINGS)}); give a folder that has some")
+        self._stamps = self._times(folder, options.fps)
+        poses = _poses_in(folder) if not options.poses else file_of(options.poses, folder)
+        if poses is None:
+            raise NoPoses(f"{folder}: has no {POSE_FILES[0]}; put it there or name ?poses=FILE")
+        self._poses = poses_of_images(poses, self._stamps)
+        self._T_body_lidar = np.eye(4)
+        if options.axes and options.axes != "ros":
+            self._T_body_lidar[:3, :3] = AXES[options.axes].T @ AXES["ros"]
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether `where` is a folder with clouds and poses, or says where its poses are."""
+        folder = folder_part(where)
+        if not os.path.isdir(folder):
+            return False
+        posed = "poses=" in where[len(folder) :] or _poses_in(Path(folder)) is not None
+        return posed and bool(_clouds_in(Path(folder)))
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def stamp_ns(self, i: int) -> int:
+        """Return the time of cloud `i`."""
+        return self._stamps[i]
+
+    def file(self, i: int) -> Path:
+        """Return its file."""
+        return self._files[i]
+
+    def cloud(self, i: int) -> Cloud:
+        """Return cloud `i`."""
+        path, T = self._files[i], self._poses.at(self._stamps[i]) @ self._T_body_lidar
+        if path.suffix.lower() == ".bin":
+            points = read_velodyne(path)
+        else:
+            try:
+                points = read_points(path).xyz
+            except MapFileError as error:
+                raise FrameRefused("unreadable", str(error)) from None
+        return Cloud(points, T, self._stamps[i], self.lidar, name=str(path))
+
+    def _times(self, folder: Path, fps: float) -> list[int]:
+        """Return the times of all clouds, ascending."""
+        stems = [path.stem for path in self._files]
+        if not fps and all(NANOSECONDS.fullmatch(stem) for stem in stems):
+            return [int(stem) for stem in stems]
+        if not fps and all(SECONDS.fullmatch(stem) for stem in stems):
+            return [ns_from_seconds(stem) for stem in stems]
+        listed = next((folder / name for name in TIMES if (folder / name).is_file()), None)
+        if not fps and listed is not None:
+            return self._listed(listed)
+        rate = fps or RATE_HZ
+        if not fps:
+            self.notes = (f"{self.name}: nothing says when clouds were taken; {rate:g} a second (?fps=)",)
+        return [round(1e9 * i / rate) for i in range(len(stems))]
+
+    def _listed(self, path: Path) -> list[int]:
+        try:
+            stamps = [ns_from_seconds(line.split()[0]) for line in path.read_text().splitlines() if line.strip()]
+        except (OSError, UnicodeDecodeError, ValueError) as error:
+            raise SourceError(f"{path}: {error}; write a time in seconds in each line") from None
+        if len(stamps) != len(self._files) or any(b <= a for a, b in pairwise(stamps)):
+            raise SourceError(
+                f"{path}: has {len(stamps)} times of {len(self._files)} clouds; write one for each, ascending"
+            )
+        return stamps
+
+
+def _clouds_in(folder: Path) -> list[Path]:
+    """Return the clouds of a folder in the order of their names' numbers; of the first subfolder that has some."""
+    for place in (folder / name for name in SUBFOLDERS):
+        if place.is_dir():
+            endings = ENDINGS if place != folder else ENDINGS[:2]  # a `.bin` may be anything
+            found = [place / name for name in file_names(place) if Path(name).suffix.lower() in endings]
+            if found:
+                return sorted(found, key=lambda path: _in_order(path.stem))
+    return []
+
+
+def _in_order(stem: str) -> tuple[list[int], str]:
+    return [int(number) for number in re.findall(r"\d{1,30}", stem)], stem
+
+
+def _poses_in(folder: Path) -> Path | None:
+    return next((folder / name for name in POSE_FILES if (folder / name).is_file()), None)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of recordings with clouds, and what they all have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from math import inf
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from stereovox.cameras.lidar import Lidar
+from stereovox.errors import FrameRefused, SourceError, StereovoxError
+from stereovox.frame import FORWARD, Cloud
+from stereovox.sources import parameters
+from stereovox.sources.base import Source
+
+OptionsT = TypeVar("OptionsT", bound="LidarOptions")
+
+
+@dataclass(frozen=True)
+class LidarOptions:
+    """What may stand behind the name of any recording with clouds, as in `scans?range_max=80&sigma=0.03`.
+
+    sigma: standard deviation of a range in metres (0: 0.02). range_min: metres below which points are left out, such
+    as those on the vehicle (-1: 0.5). range_max: metres beyond which a point is no surface (0: no limit).
+    """
+
+    sigma: float = 0.0
+    range_min: float = -1.0
+    range_max: float = 0.0
+
+    @property
+    def lidar(self) -> Lidar:
+        """Return the lidar; raises SourceError for numbers out of range."""
+        usual = Lidar()
+        try:
+            return Lidar(
+                self.sigma or usual.sigma,
+                usual.range_min if self.range_min == -1 else self.range_min,
+                self.range_max or inf,
+            )
+        except StereovoxError as error:
+            raise SourceError(str(error)) from None
+
+
+def options_of(where: str, start: int, kind: type[OptionsT]) -> tuple[OptionsT, dict[str, str]]:
+    """Return the options of a class that stand in `where` from a place on, and all others as they are.
+
+    Raises SourceError for bad ones.
+    """
+    known = {field.name: field.default for field in fields(kind)}
+    try:
+        _, given = parameters.split(f"name{where[start:]}")
+        ours = {key: text for key, text in given.items() if key in known}
+        options = kind(**parameters.typed(ours, known))
+        options.lidar  # noqa: B018 - its numbers are checked
+        return options, {key: text for key, text in given.items() if key not in known}
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+def no_others(where: str, others: dict[str, str], kind: type[LidarOptions]) -> None:
+    """Raise SourceError where there are options that a class does not know."""
+    try:
+        parameters.typed(others, {field.name: field.default for field in fields(kind)})
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+class CloudSource(Source, Protocol):
+    """A recording of clouds.
+
+    Attributes:
+        lidar: What their ranges can be trusted for.
+        camera: A camera that looks forward, for pictures.
+    """
+
+    lidar: Lidar
+    camera: Any = FORWARD
+
+    def cloud(self, i: int) -> Cloud:
+        """Return cloud number `i`, from 0; raises FrameRefused where it cannot be used."""
+        ...
+
+    def stamp_ns(self, i: int) -> int:
+        """Return its time in nanoseconds."""
+        ...
+
+    def file(self, i: int) -> str | Path:
+        """Return what it comes from, for messages."""
+        ...
+
+    def frame(self, i: int) -> Cloud:
+        """Return cloud `i`; it has no points, and a pose of NaN, where it has a `fault`."""
+        i = range(len(self))[i]
+        try:
+            return self.cloud(i)
+        except FrameRefused as refused:
+            return Cloud(
+                np.empty((0, 3), np.float32), np.full((4, 4), np.nan), self.stamp_ns(i), self.lidar,
+                name=str(self.file(i)), fault=refused.reason, fault_detail=str(refused),
+            )  # fmt: skip

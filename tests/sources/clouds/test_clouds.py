@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of lidars: folders of clouds, KITTI's, clouds and scans of bags; with poses, times and faults."""
+
+import made_kitti
+import numpy as np
+import pytest
+from made_robot_bags import MS, START_NS, RobotBagMaker, planar_motion, planar_numbers
+
+import stereovox as sv
+from stereovox.cli import main
+from stereovox.errors import NoPoses, SourceError
+from stereovox.sources.bags.robot_messages import read_point_cloud
+from stereovox.sources.trajectory import write_trajectory
+
+POINTS = np.array([[1.0, 2.0, 0.5], [3.0, -1.0, 0.0], [np.nan, 0.0, 0.0]], np.float32)
+
+
+def pose(n):
+    T = np.eye(4)
+    T[:3, 3] = 0.1 * n, 0.2 * n, 0.0
+    return T
+
+
+def write_pcd(path, points):
+    lines = "\n".join(" ".join(map(str, point)) for point in points)
+    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+    path.write_text(f"{head}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n{lines}\n")
+
+
+def write_ply(path, points):
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    path.write_text(f"{head}end_header\n" + "\n".join(" ".join(map(str, point)) for point in points) + "\n")
+
+
+def write_bin(path, points):
+    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(path)
+
+
+def write_poses(folder, stamps_ns, name="poses.txt"):
+    write_trajectory(folder / name, stamps_ns, np.array([pose(n) for n in range(len(stamps_ns))]), "lidar")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a folder with three clouds whose names are their times."""
+    stamps = [10**9 + n * 10**8 for n in range(3)]
+    for n, stamp in enumerate(stamps):
+        write_pcd(tmp_path / f"{stamp / 1e9:.6f}.pcd", POINTS + 0.01 * n)
+    write_poses(tmp_path, stamps)
+    return tmp_path
+
+
+def test_a_folder_of_clouds(folder):
+    source = sv.open_source(folder)
+    assert len(source) == 3
+    assert source.notes == ()
+    for n, cloud in enumerate(source):
+        assert cloud.fault is None
+        assert cloud.stamp_ns == 10**9 + n * 10**8
+        np.testing.assert_allclose(cloud.T_world_sensor, pose(n), atol=1e-6)
+        np.testing.assert_allclose(cloud.points, POINTS + 0.01 * n, atol=1e-6)
+        assert cloud.lidar == sv.Lidar()
+
+
+@pytest.mark.parametrize(("ending", "write"), [("pcd", write_pcd), ("ply", write_ply), ("bin", write_bin)])
+def test_every_kind_of_file_in_a_subfolder_numbered_with_kitti_poses(tmp_path, ending, write):
+    (tmp_path / "clouds").mkdir()
+    for n in (0, 2, 10):  # in the order of their numbers
+        write(tmp_path / f"clouds/scan{n}.{ending}", POINTS[:2] + n)
+    rows = [" ".join(f"{x:.6f}" for x in pose(n)[:3].ravel()) for n in range(3)]
+    (tmp_path / "poses.txt").write_text("\n".join(rows))
+    source = sv.open_source(f"{tmp_path}?range_max=50&sigma=0.05&range_min=0")
+    assert [frame.points[0, 0] for frame in source] == [1, 3, 11]
+    assert [frame.stamp_ns for frame in source] == [0, 10**8, 2 * 10**8]
+    assert "10 a second" in source.notes[0]
+    np.testing.assert_allclose(source.frame(2).T_world_sensor, pose(2), atol=1e-5)
+    assert source.lidar == sv.Lidar(0.05, 0.0, 50.0)
+    quick = sv.open_source(f"{tmp_path}?fps=20")
+    assert quick.frame(2).stamp_ns == 10**8
+    assert not quick.notes
+
+
+def test_times_in_a_file_and_poses_between_which_is_interpolated(tmp_path):
+    for n in range(3):
+        write_pcd(tmp_path / f"{n}.pcd", POINTS)
+    (tmp_path / "times.txt").write_text("100.0\n100.05\n100.1\n")
+    write_poses(tmp_path, [99_980_000_000, 100_060_000_000, 100_120_000_000], "way.tum")
+    source = sv.open_source(f"{tmp_path}?poses=way.tum")
+    assert [frame.stamp_ns for frame in source] == [100_000_000_000, 100_050_000_000, 100_100_000_000]
+    np.testing.assert_allclose(source.frame(0).T_world_sensor[:2, 3], [0.025, 0.05], atol=1e-6)
+    (tmp_path / "times.txt").write_text("100.0\n100.05\n")
+    with pytest.raises(SourceError, match="has 2 times of 3 clouds"):
+        sv.open_source(f"{tmp_path}?poses=way.tum")
+
+
+def test_poses_of_a_camera_beside_the_lidar_have_other_axes(tmp_path):
+    write_pcd(tmp_path / "1000000000000000000.pcd", np.array([[5.0, 0.0, 0.0]]))
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # a camera that looks along x of a world with z up
+    write_trajectory(tmp_path / "poses.txt", [10**18], T[None], "camera")
+    frame = sv.open_source(f"{tmp_path}?axes=optical").frame(0)
+    np.testing.assert_allclose(frame.T_world_sensor, np.eye(4), atol=1e-6)
+
+
+def test_a_damaged_cloud_is_a_frame_with_a_fault(folder):
+    files = sorted(folder.glob("*.pcd"))
+    files[1].write_text("nonsense")
+    frames = list(sv.open_source(folder))
+    assert [frame.fault for frame in frames] == [None, "unreadable", None]
+    assert str(files[1]) in frames[1].fault_detail
+    mapper = sv.Mapper(voxel_size=0.2)
+    assert mapper.add(frames[1]).refused == "unreadable"
+
+
+def test_a_folder_without_poses_says_so(folder):
+    (folder / "poses.txt").unlink()
+    with pytest.raises((NoPoses, SourceError), match="poses"):
+        sv.open_source(folder)
+    with pytest.raises(SourceError, match="range_mx"):
+        sv.open_source(f"{folder}?poses=x&range_mx=3")
+
+
+@pytest.mark.parametrize("options", ["sigma=-1", "range_max=0.1", "axes=west", "fps=-1"])
+def test_bad_options_are_one_line(folder, options):
+    with pytest.raises(SourceError) as refused:
+        sv.open_source(f"{folder}?{options}")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_folder_becomes_a_map_by_the_command(folder, tmp_path, capsys):
+    out = tmp_path / "map"
+    assert main(["map", str(folder), "--out", str(out), "--voxel-size", "0.2"]) == 0
+    assert sv.load_map(out).frames == 3
+    capsys.readouterr()
+    assert main(["info", str(folder)]) == 0
+    assert "3 clouds" in capsys.readouterr().err
+
+
+def test_the_lidar_of_kitti_and_both_sensors_of_it(tmp_path):
+    drive = made_kitti.raw(tmp_path, 3)
+    images = sv.open_source(drive)
+    clouds = sv.open_source(f"{drive}?sensor=velodyne&range_max=30")
+    assert len(clouds) == 3
+    for n, cloud in enumerate(clouds):
+        scan = images.scan(n)
+        np.testing.assert_array_equal(cloud.points, scan.points)
+        np.testing.assert_array_equal(cloud.T_world_sensor, scan.T_world_lidar)
+        assert (cloud.stamp_ns, cloud.lidar.range_max, cloud.sensor) == (scan.stamp_ns, 30, "velodyne")
+    both = sv.open_source(f"{drive}?sensor=both&poses=oxts")
+    assert [type(frame).__name__ for frame in both] == ["StereoFrame", "Cloud"] * 3
+    assert [frame.stamp_ns for frame in both] == [images.stamp_ns(n) for n in (0, 0, 1, 1, 2, 2)]
+    (drive / "velodyne_points/data/0000000001.bin").unlink()
+    assert [frame.fault for frame in clouds] == [None, "missing_file", None]
+
+
+def test_a_recording_without_lidar_has_no_velodyne(tmp_path):
+    drive = made_kitti.raw(tmp_path, 2)
+    (drive.parent / "calib_velo_to_cam.txt").unlink()
+    with pytest.raises(SourceError, match="no lidar scans"):
+        sv.open_source(f"{drive}?sensor=velodyne&poses={_poses_file(drive)}")
+
+
+def _poses_file(drive):
+    write_trajectory(drive / "way.tum", [0, 1], np.array([np.eye(4)] * 2), "camera")
+    return "way.tum"
+
+
+def write_bag(path, times=None, kind=7, count=3):
+    """Write clouds of a lidar that drives along x at 1 m/s, with the times of their points as field `t`."""
+    with RobotBagMaker(path) as bag:
+        for k in range(10 * count + 20):
+            stamp = START_NS + (10 * k - 100) * MS
+            bag.tf(stamp, "odom", "lidar", planar_numbers((stamp - START_NS) / 1e9, 0, 0))
+        for n in range(count):
+            stamp = START_NS + 100 * n * MS
+            bag.add("/points", "sensor_msgs/PointCloud2", stamp + 2 * MS, _cloud(bag, stamp, times, kind))
+        bag.scans(3, frame_id="lidar")
+    return path
+
+
+def _cloud(bag, stamp, times, kind):
+    points = np.array([[2.0, 1.0, 0.0], [4.0, 1.0, 0.0], [np.nan] * 3], np.float32)
+    points[0, 2] = 1e-9 * (stamp - START_NS)  # no two clouds are alike
+    if times is None:
+        return bag.cloud(stamp, points)
+    dtype = {7: "<f4", 6: "<u4", 8: "<f8"}[kind]
+    data = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", dtype)])
+    data["x"], data["y"], data["z"] = points.T
+    data["t"] = times(stamp) if callable(times) else times
+    fields = [bag.field(name, 4 * k, 7) for k, name in enumerate("xyz")] + [bag.field("t", 12, kind)]
+    step = data.dtype.itemsize
+    return bag.cloud(
+        stamp, points, fields=fields, point_step=step, row_step=3 * step, data=np.frombuffer(data.tobytes(), np.uint8)
+    )
+
+
+@pytest.fixture(params=["drive.bag", "drive"])
+def bag(request, tmp_path):
+    return write_bag(tmp_path / request.param)
+
+
+def test_clouds_of_a_bag(bag):
+    source = sv.open_source(f"{bag}?cloud=/points")
+    assert len(source) == 3
+    assert any("have no times" in note for note in source.notes)
+    for n, cloud in enumerate(source):
+        assert cloud.fault is None
+        assert cloud.stamp_ns == START_NS + 100 * n * MS
+        np.testing.assert_allclose(cloud.T_world_sensor, planar_motion(0.1 * n, 0, 0), atol=1e-6)
+        assert cloud.origins is None
+    mapper = sv.Mapper(voxel_size=0.5)
+    assert [mapper.add(cloud).refused for cloud in source] == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "times"),
+    [
+        (7, [0.0, 0.05, 0.0]),
+        (6, [0, 50_000_000, 0]),
+        (8, lambda stamp: 1e-9 * stamp + np.array([0.0, 0.05, 0.0])),
+        (8, lambda stamp: stamp + np.array([0.0, 5e7, 0.0])),
+    ],
+    ids=["seconds", "nanoseconds", "clock", "clock in nanoseconds"],
+)
+def test_points_with_times_are_straightened(tmp_path, kind, times):
+    path = write_bag(tmp_path / "drive.bag", times, kind)
+    cloud = sv.open_source(f"{path}?cloud=/points").frame(0)
+    np.testing.assert_allclose(cloud.points[:2], [[2.0, 1, 0], [4.05, 1, 0]], atol=2e-3)
+    np.testing.assert_allclose(cloud.origins[:2], [[0, 0, 0], [0.05, 0, 0]], atol=2e-3)
+    raw = sv.open_source(f"{path}?cloud=/points&deskew=0").frame(0)
+    np.testing.assert_array_equal(raw.points[1], [4, 1, 0])
+    assert raw.origins is None
+
+
+def test_scans_of_a_bag_in_three_dimensions(bag):
+    source = sv.open_source(f"{bag}?scan=/scan")
+    cloud = source.frame(0)
+    np.testing.assert_allclose(np.linalg.norm(cloud.points, axis=1), [1, 2, 3], atol=1e-6)
+    np.testing.assert_allclose(np.arctan2(cloud.points[:, 1], cloud.points[:, 0]), [-1, -0.5, 0], atol=1e-6)
+    assert cloud.lidar.range_max == pytest.approx(5.6)
+    mapper = sv.Mapper(voxel_size=0.2)
+    assert mapper.add(cloud).refused is None
+
+
+def test_beams_without_echo_are_free_up_to_where_the_lidar_measures(tmp_path):
+    with RobotBagMaker(tmp_path / "a.bag") as bag:
+        for k in range(20):
+            bag.tf(START_NS + (k - 5) * 20 * MS, "odom", "laser", planar_numbers(0, 0, 0))
+        message = bag.scan(START_NS, [1.0, np.inf, np.nan, 0.0])
+        bag.add("/scan", "sensor_msgs/LaserScan", START_NS, message)
+    cloud = sv.open_source(f"{tmp_path / 'a.bag'}?scan=/scan").frame(0)
+    assert len(cloud.points) == len(cloud.clear) == 1
+    np.testing.assert_allclose(cloud.clear[0], 5.6 * np.array([np.cos(-0.5), np.sin(-0.5), 0]), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ("cloud=/nowhere", "no topic /nowhere"),
+        ("cloud=/scan", "holds sensor_msgs/LaserScan"),
+        ("cloud=/points&scan=/scan", "give one of"),
+        ("cloud=/points&depth=/d", "unknown parameter 'depth'"),
+        ("cloud=/points&sigma=0.0001&range_min=-3", "range"),
+    ],
+)
+def test_what_a_bag_does_not_have_is_one_line(bag, options, why):
+    with pytest.raises(SourceError, match=why) as refused:
+        sv.open_source(f"{bag}?{options}")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_bag_without_depth_images_names_its_clouds(bag):
+    with pytest.raises(SourceError, match=r"\?cloud=/points"):
+        sv.open_source(bag)
+
+
+def test_a_cloud_whose_time_no_pose_covers_has_a_fault(tmp_path):
+    path = write_bag(tmp_path / "drive.bag", [0.0, 5.0, 0.0])
+    assert sv.open_source(f"{path}?cloud=/points").frame(0).fault == "no_pose"
+
+
+def test_fields_of_times_that_do_not_fit_are_left_out():
+    from made_robot_bags import Messages
+
+    messages = Messages(1)
+    cloud = messages.cloud(
+        5,
+        np.ones((2, 3)),
+        fields=[*(messages.field(n, 4 * k, 7) for k, n in enumerate("xyz")), messages.field("t", 10, 8)],
+    )
+    assert read_point_cloud(messages.wire("sensor_msgs/PointCloud2", cloud)).times_s is None

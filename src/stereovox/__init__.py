@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from stereovox.corrected_poses import CorrectedPoses as CorrectedPoses
     from stereovox.corrected_poses import OdometryJumps as OdometryJumps
     from stereovox.corrected_poses import poses_by_path as poses_by_path
+    from stereovox.depth.cloud import deskewed as deskewed
     from stereovox.errors import StereovoxError as StereovoxError
     from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
     from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
@@ -133,6 +134,7 @@ _HOMES = {
     "CorrectedPoses": "corrected_poses",
     "OdometryJumps": "corrected_poses",
     "poses_by_path": "corrected_poses",
+    "deskewed": "depth.cloud",
     "Poses": "sources.poses",
     "ClosedMap": "closing",
     "LoopClosure": "closing",

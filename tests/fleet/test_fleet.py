@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps made by many workers are those of one machine, bit for bit, however they are cut, killed and gone on with."""
 
-import atexit
 import os
 import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from tempfile import mkdtemp
 
-import cv2
 import numpy as np
 import pytest
+from made_fleet import SETTINGS, alone, assert_same, recording
 
 import stereovox as sv
 from stereovox.deadline import Levels
@@ -26,33 +24,6 @@ from stereovox.places import Place
 from stereovox.sources.trajectory import write_trajectory
 
 distributed = pytest.importorskip("distributed")
-SETTINGS = {"profile": "default", "voxel_size": 0.2}
-
-
-def write_folder(folder, frames):
-    """Write a folder of TUM's layout."""
-    (folder / "depth").mkdir(parents=True)
-    lines, camera = [], frames[0].camera
-    for frame in frames:
-        name = f"depth/{frame.stamp_ns / 1e9:.9f}.png"
-        depth = np.nan_to_num(np.where(np.isfinite(frame.depth), frame.depth, 0) * frame.depth_scale * 5000)
-        cv2.imwrite(str(folder / name), depth.astype(np.uint16))
-        lines.append(f"{frame.stamp_ns / 1e9:.9f} {name}")
-    (folder / "depth.txt").write_text("\n".join(lines) + "\n")
-    poses = np.array([frame.T_world_sensor for frame in frames])
-    write_trajectory(folder / "groundtruth.txt", [frame.stamp_ns for frame in frames], poses, "camera")
-    names = "width", "height", "fx", "fy", "cx", "cy"
-    (folder / "camera.toml").write_text("".join(f"{name} = {getattr(camera, name)}\n" for name in names))
-
-
-@cache
-def recording(number):
-    """Return the folder of a short recording, one of several ways through the same rooms."""
-    folder = Path(mkdtemp(prefix="stereovox-test-")) / f"drive{number}"
-    atexit.register(shutil.rmtree, folder.parent)
-    frames = list(sv.open_source(f"sim:apartment?image_width=64&seed={number}", f"{20 * number}::70"))[:12]
-    write_folder(folder, frames)
-    return str(folder)
 
 
 @pytest.fixture(scope="module")
@@ -70,31 +41,17 @@ def mapped(scheduler):
     return partial(map_fleet, **SETTINGS, box_m=3.2, scheduler=scheduler)
 
 
-@cache
-def alone(recording, **settings):
-    """Return the map of a recording by one mapper, which keeps its frames."""
-    mapper = sv.Mapper("default", voxel_size=0.2, **{"map.keep_frames": True, **settings})
-    for frame in sv.open_source(recording):
-        mapper.add(frame)
-    return mapper.map
-
-
 def of_all(*recordings, **settings):
     """Return the blocks of one map of the frames that each recording's own mapper trusts, one after the other."""
     config = sv.load_config("default", voxel_size=0.2, **settings)
     storage, level = sv.VoxelMap(config).storage, Levels(config)("full")
-    for recording in recordings:
-        for frame in (alone(recording, **settings) if isinstance(recording, str) else recording).kept_frames.frames:
+    for one in recordings:
+        for frame in (alone(one, **settings) if isinstance(one, str) else one).kept_frames.frames:
             image = level.prepare(frame.frame()).image
             storage.look_from(image.viewpoint)
             storage.add(level.integrator.evidence(image))
             storage.history.frames += 1
     return storage.blocks()
-
-
-def assert_same(ours, theirs):
-    for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_one_recording_makes_the_map_of_one_mapper(mapped, where):

@@ -39,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default: as before, or default)")
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
-    parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 cells)")
+    parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 or 512 cells, by reach)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
     parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")
     parser.add_argument("--resume", action="store_true", help="go on with the map at --out, for these recordings")

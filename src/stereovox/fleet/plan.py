@@ -13,10 +13,9 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.fleet.fleet import settings_for
+from stereovox.fleet.fleet import box_side, settings_for
 from stereovox.fleet.recordings import Recording, boxes_with, recordings_of
 from stereovox.mapper import Mapper
-from stereovox.maps.boxed_map import side_of
 from stereovox.maps.boxes import BoxLayout
 from stereovox.opening import open_source
 
@@ -78,7 +77,7 @@ def plan_fleet(
     """
     listed = recordings_of(recordings)
     config, _ = settings_for(listed, profile, overrides)
-    layout = BoxLayout(config, side_of(box_m, config.cell))
+    layout = BoxLayout(config, box_side(box_m, config))
     frames = stored = 0
     seconds, seen, unreadable = 0.0, [], []
     for n, one in enumerate(listed, 1):

@@ -51,6 +51,13 @@ if TYPE_CHECKING:
     from stereovox.maps import save_boxed as save_boxed
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.mavlink.directions import DirectionRules as DirectionRules
+    from stereovox.mavlink.link import MavlinkLink as MavlinkLink
+    from stereovox.mavlink.poses import PoseReceiver as PoseReceiver
+    from stereovox.mavlink.poses import receive_poses as receive_poses
+    from stereovox.mavlink.sectors import SectorRules as SectorRules
+    from stereovox.mavlink.sectors import obstacle_sectors as obstacle_sectors
+    from stereovox.mavlink.sending import ObstacleSender as ObstacleSender
     from stereovox.opening import open_images as open_images
     from stereovox.opening import open_source as open_source
     from stereovox.products.coarsen import coarsen as coarsen
@@ -142,6 +149,13 @@ _HOMES = {
     "FleetPlan": "fleet",
     "map_fleet": "fleet",
     "plan_fleet": "fleet",
+    "DirectionRules": "mavlink.directions",
+    "MavlinkLink": "mavlink.link",
+    "PoseReceiver": "mavlink.poses",
+    "receive_poses": "mavlink.poses",
+    "SectorRules": "mavlink.sectors",
+    "obstacle_sectors": "mavlink.sectors",
+    "ObstacleSender": "mavlink.sending",
     "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",

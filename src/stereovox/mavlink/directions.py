@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.mavlink.sectors import check_number_of_cells, states_of
 from stereovox.maps import State, VoxelMap
+from stereovox.mavlink.sectors import check_number_of_cells, states_of
 from stereovox.se3 import Transform, rigidity_error
 
 LAYERS, LAYER_DEG, SECTOR_DEG = 5, 30, 45
@@ -51,8 +51,8 @@ class DirectionRules:
     def __post_init__(self) -> None:
         if not (0.1 <= self.max_distance <= 1000 and 0 <= self.own_radius <= self.max_distance):
             raise StereovoxError(
-                f"max_distance {self.max_distance:g}, own_radius {self.own_radius:g}: give 0.1 to 1000 m, and no larger "
-                "radius than that"
+                f"max_distance {self.max_distance:g}, own_radius {self.own_radius:g}: give 0.1 to 1000 m, and no "
+                "larger radius than that"
             )
         if not self.oldest_s >= 0:
             raise StereovoxError(f"oldest_s {self.oldest_s:g}: give seconds, 0 or more")
@@ -79,9 +79,9 @@ def nearest_places(
     rules = rules or DirectionRules()
     if not rigidity_error(T_world_body) < 1e-3:
         raise StereovoxError("T_world_body is no rigid motion (4, 4); give a rotation and metres")
-    cell, origin = np.asarray(voxel_map.config.cell), T_world_body[:3, 3]
+    cell, origin = np.array(voxel_map.config.cell, np.float64), np.asarray(T_world_body[:3, 3], np.float64)
     cells = _cells_within(origin, cell, rules.max_distance)
-    centres = (cells + 0.5) * cell
+    centres: NDArray[np.float64] = (cells + 0.5) * cell
     states = states_of(voxel_map, centres, rules.oldest_s)
     counts = (states == State.OCCUPIED) | (states == State.TENTATIVE)
     if rules.unknown:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable
-from importlib import import_module
 from time import monotonic_ns
 from types import ModuleType
 from typing import Any
@@ -34,12 +33,13 @@ def warn(line: str) -> None:
 def dialect() -> ModuleType:
     """Return pymavlink's messages of MAVLink 2; raises MissingExtra where it is not installed."""
     try:
-        return import_module("pymavlink.dialects.v20.ardupilotmega")
+        from pymavlink.dialects.v20 import ardupilotmega
     except ImportError:
         raise MissingExtra("pymavlink", "mavlink") from None
+    return ardupilotmega
 
 
-class Link:
+class MavlinkLink:
     """Connection to an autopilot, as its onboard computer. Threads may share it.
 
     It sends a heartbeat a second (MAV_TYPE_ONBOARD_CONTROLLER), asks for the autopilot's time five times a second,
@@ -66,7 +66,8 @@ class Link:
             raise StereovoxError(f"system {system}: give the vehicle's number, 1 to 255")
         self.messages, self.url, self.system, self.now_ns = dialect(), url, system, clock
         self.clock = RemoteClock()
-        self._tell, self._failure = tell, ""
+        self._tell = tell
+        self._failures: set[str] = set()
         self._transport = open_transport(url)
         self._packer = self.messages.MAVLink(self, system, COMPONENT)
         self._parser = self.messages.MAVLink(self, system, COMPONENT)
@@ -95,7 +96,9 @@ class Link:
             Whether it could be handed to the system; datagrams may still be lost.
         """
         with self._sending:
-            return self._attempt(lambda: self._transport.write(message.pack(self._packer)), count=True)
+            done = self._attempt("write", lambda: self._transport.write(message.pack(self._packer)))
+            self._packer.seq = (self._packer.seq + 1) % 256
+            return done
 
     def close(self) -> None:
         """End the connection."""
@@ -103,7 +106,7 @@ class Link:
         self._thread.join()
         self._transport.close()
 
-    def __enter__(self) -> Link:
+    def __enter__(self) -> MavlinkLink:
         """Return itself."""
         return self
 
@@ -121,7 +124,7 @@ class Link:
             if now_ns >= timesync_ns:
                 timesync_ns = now_ns + TIMESYNC_NS
                 self.send(self.messages.MAVLink_timesync_message(0, self.now_ns()))
-            self._attempt(self._read)
+            self._attempt("read", self._read)
 
     def _read(self) -> None:
         data = self._transport.read(READ_S)
@@ -137,7 +140,15 @@ class Link:
             elif message.ts1 <= came_ns:
                 self.clock.answered(message.ts1, message.tc1, came_ns)
         for handler in tuple(self._handlers):
-            handler(message, came_ns)
+            try:
+                handler(message, came_ns)
+            except Exception as error:  # one message must not end the connection
+                self._told_once(f"{self.url}: {message.get_type()} cannot be used: {error}")
+
+    def _told_once(self, line: str) -> None:
+        if line not in self._failures:
+            self._failures.add(line)
+            self._tell(line)
 
     def _heartbeat(self) -> Any:
         m = self.messages
@@ -145,21 +156,21 @@ class Link:
             m.MAV_TYPE_ONBOARD_CONTROLLER, m.MAV_AUTOPILOT_INVALID, 0, 0, m.MAV_STATE_ACTIVE, 3
         )
 
-    def _attempt(self, act: Callable[[], object], count: bool = False) -> bool:
+    def _attempt(self, what: str, act: Callable[[], object]) -> bool:
         """Do something that may fail because of the connection; tell once when it does, and once when it works."""
         try:
             act()
         except OSError as error:
             if not self._closed.is_set():
-                self._told(f"{self.url}: {error}; nothing reaches the autopilot until it works again")
+                self._failed(what, error)
                 self._closed.wait(READ_S)
             return False
-        if count:
-            self._packer.seq = (self._packer.seq + 1) % 256
-            self._told("")
+        if what in self._failures:
+            self._failures.discard(what)
+            self._tell(f"{self.url}: works again")
         return True
 
-    def _told(self, failure: str) -> None:
-        if bool(failure) != bool(self._failure):
-            self._tell(failure or f"{self.url}: works again")
-        self._failure = failure
+    def _failed(self, what: str, error: OSError) -> None:
+        if what not in self._failures:
+            self._failures.add(what)
+            self._tell(f"{self.url}: cannot {what} ({error}); is the autopilot still connected?")

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.mavlink.link import Link, Tell, warn
+from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.se3 import Transform, from_quaternion, interpolate
 from stereovox.sources.tracker import turned
 
@@ -43,7 +43,7 @@ class PoseReceiver:
     """Hands the poses that an autopilot sends to `into`, stamped by this machine's clock.
 
     Args:
-        connection: A `Link`, or the address of one, which is then closed with the receiver.
+        connection: A `MavlinkLink`, or the address of one, which is then closed with the receiver.
         into: Its `add(stamp_ns, T_world_body)` is called by the thread that reads. T_world_body (4, 4) maps the
             vehicle's body (optical axes: x right, y down, z forward) into a world x north, y west, z up, with the
             autopilot's origin. stamp_ns: when the vehicle was there, by the clock of the link.
@@ -55,12 +55,12 @@ class PoseReceiver:
         link: The connection.
 
     Raises:
-        StereovoxError: As for `Link`.
+        StereovoxError: As for `MavlinkLink`.
     """
 
-    def __init__(self, connection: str | Link, into: TakesPoses, *, tell: Tell = warn):
+    def __init__(self, connection: str | MavlinkLink, into: TakesPoses, *, tell: Tell = warn):
         self._own = isinstance(connection, str)
-        self.link = Link(connection, tell=tell) if isinstance(connection, str) else connection
+        self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
         self._into, self._tell = into, tell
         self.taken = 0
         self.passed_over: dict[str, int] = {}
@@ -154,11 +154,11 @@ class PoseReceiver:
             self._tell(f"{self.link.url}: {line}")
 
 
-def receive_poses(connection: str | Link, into: TakesPoses, *, tell: Tell = warn) -> PoseReceiver:
+def receive_poses(connection: str | MavlinkLink, into: TakesPoses, *, tell: Tell = warn) -> PoseReceiver:
     """Hand the poses that an autopilot sends to `into` until the receiver is closed; see `PoseReceiver`.
 
     Args:
-        connection: A `Link`, or the address of one.
+        connection: A `MavlinkLink`, or the address of one.
         into: What takes them.
         tell: Called with one line when poses cannot be used.
 
@@ -166,7 +166,7 @@ def receive_poses(connection: str | Link, into: TakesPoses, *, tell: Tell = warn
         The receiver, already at work.
 
     Raises:
-        StereovoxError: As for `Link`.
+        StereovoxError: As for `MavlinkLink`.
     """
     return PoseReceiver(connection, into, tell=tell)
 

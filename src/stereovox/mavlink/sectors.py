@@ -126,7 +126,7 @@ class Heading(NamedTuple):
     """(2,) unit vector, x and y."""
 
 
-def sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: SectorRules | None = None) -> Sectors:
+def obstacle_sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: SectorRules | None = None) -> Sectors:
     """Return how far the sectors round a body are known to be free.
 
     A cell counts in all sectors that it reaches into, with the distance of its nearest point.
@@ -156,7 +156,7 @@ def sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: SectorRules | N
 
 
 def heading_of(voxel_map: VoxelMap, T_world_body: Transform) -> Heading:
-    """Return where a body looks in the map's horizontal plane; raises StereovoxError as `sectors` does."""
+    """Return where a body looks in the map's horizontal plane; raises StereovoxError as `obstacle_sectors` does."""
     if not rigidity_error(T_world_body) < 1e-3:
         raise StereovoxError("T_world_body is no rigid motion (4, 4); give a rotation and metres")
     axes = upright_axes(voxel_map.config.up)
@@ -206,9 +206,7 @@ class _Columns:
             np.minimum.at(found, (first + step)[reached] % SECTORS, away[reached])
         return found
 
-    def _reach(
-        self, row: NDArray[np.intp], column: NDArray[np.intp]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _reach(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the first and last sector, not wrapped, that columns reach into."""
         x, y = self._x[:, row, 0], self._y[:, 0, column]
         middle = self._bearing_deg(x.mean(axis=0), y.mean(axis=0))

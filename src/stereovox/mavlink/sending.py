@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import AnyFrame, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.mavlink.directions import DirectionRules, nearest_places
-from stereovox.mavlink.link import Link, Tell, warn
-from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, sectors
-from stereovox.se3 import Transform, inverse, rigidity_error
+from stereovox.mavlink.link import MavlinkLink, Tell, warn
+from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
 
 HIGHEST_RATE_HZ = 200.0
 PATIENCE = 0.5
@@ -25,17 +26,17 @@ PATIENCE = 0.5
 class ObstacleSender:
     """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D where that is asked for.
 
-    It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own reads
-    the map; each message is for the pose of the last frame that the map took in, and waits up to half a period for the
-    next one. Nothing is sent before the first, and nothing once the camera that is silent longest has been so for
-    `max_age_s`: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as failed.
+    It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own
+    reads the map; each message is for the pose of the last frame that the map took in, and waits up to half a period
+    for the next one. Nothing is sent before the first, and nothing once the camera that is silent longest has been so
+    for `max_age_s`: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as failed.
 
     `time_usec` and `time_boot_ms` are when that last frame arrived, by this machine's clock, which the autopilot may
     ask for (TIMESYNC).
 
     Args:
         mapper: The mapper whose map is sent.
-        connection: A `Link`, or the address of one, which is then closed with the sender.
+        connection: A `MavlinkLink`, or the address of one, which is then closed with the sender.
         rate_hz: Messages a second. PX4 was tested with 10.
         max_age_s: Seconds since the last frame after which nothing is sent.
         rules: What OBSTACLE_DISTANCE says; by default `SectorRules()`.
@@ -49,13 +50,13 @@ class ObstacleSender:
         link: The connection.
 
     Raises:
-        StereovoxError: A value is out of range, a mount is no rigid motion, or as for `Link`.
+        StereovoxError: A value is out of range, a mount is no rigid motion, or as for `MavlinkLink`.
     """
 
     def __init__(
         self,
         mapper: Mapper,
-        connection: str | Link,
+        connection: str | MavlinkLink,
         *,
         rate_hz: float = 10.0,
         max_age_s: float = 0.5,
@@ -72,7 +73,7 @@ class ObstacleSender:
         self._mounts = _checked_mounts(mounts or {})
         self._period_s, self._max_age_s, self._tell = 1 / rate_hz, max_age_s, tell
         self._own = isinstance(connection, str)
-        self.link = Link(connection, tell=tell) if isinstance(connection, str) else connection
+        self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
         self.sent = 0
         self._T_world_body: Transform | None = None
         self._why, self._new, self._stopped = "", threading.Event(), threading.Event()
@@ -89,7 +90,7 @@ class ObstacleSender:
         if report.refused is not None:
             return
         mount = self._mounts.get(frame.sensor)
-        T_world_sensor = np.array(frame.T_world_sensor, float)
+        T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
         self._T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
         self._new.set()
 
@@ -113,14 +114,14 @@ class ObstacleSender:
         self.close()
 
     def _run(self) -> None:
-        due_ns = self.link.now_ns()
-        while not self._stopped.wait(max(due_ns - self.link.now_ns(), 0) / 1e9):
+        due = monotonic()
+        while not self._stopped.wait(max(due - monotonic(), 0)):
             self._new.wait(PATIENCE * self._period_s)
             self._new.clear()
             if self._stopped.is_set():
                 return
             self._send_or_tell()
-            due_ns = max(due_ns + round(1e9 * self._period_s), self.link.now_ns() - round(1e9 * self._period_s))
+            due = max(due + self._period_s, monotonic() - self._period_s)
 
     def _send_or_tell(self) -> None:
         try:
@@ -139,7 +140,7 @@ class ObstacleSender:
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
         if age_s > self._max_age_s:
             return f"the last trusted frame{f' of {sensor}' if sensor else ''} is {age_s:.2f} s old"
-        seen_ns = self.link.now_ns() - round(1e9 * age_s)
+        seen_ns = max(self.link.now_ns() - round(1e9 * age_s), 0)
         if not self.link.send(self._sectors(T_world_body, seen_ns)):
             return f"{self.link.url} does not take them"
         self.sent += 1
@@ -149,7 +150,7 @@ class ObstacleSender:
 
     def _sectors(self, T_world_body: Transform, seen_ns: int) -> Any:
         m, rules = self.link.messages, self._rules
-        distances = sectors(self._mapper.map, T_world_body, rules).centimetres(rules).tolist()
+        distances = obstacle_sectors(self._mapper.map, T_world_body, rules).centimetres(rules).tolist()
         return m.MAVLink_obstacle_distance_message(
             seen_ns // 1000, m.MAV_DISTANCE_SENSOR_UNKNOWN, distances, round(INCREMENT_DEG), 0, rules.max_cm,
             INCREMENT_DEG, 0.0, m.MAV_FRAME_BODY_FRD,

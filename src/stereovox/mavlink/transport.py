@@ -128,7 +128,9 @@ class SerialTransport:
         try:
             self._port = serial.Serial(device, baud, timeout=0.1)
         except (OSError, ValueError) as error:
-            raise StereovoxError(f"connection '{url}': {error}; is the device right, and may this user use it?") from None
+            raise StereovoxError(
+                f"connection '{url}': {error}; is the device right, and may this user use it?"
+            ) from None
 
     def read(self, seconds: float) -> bytes:
         """Return what came."""

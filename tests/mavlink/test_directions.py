@@ -48,7 +48,9 @@ def test_axes_are_front_right_down():
     assert nearest_places(voxel_map, looking(0), rules).tolist() == [pytest.approx([2.0, 0, 0], abs=1e-9)]
     assert nearest_places(voxel_map, looking(90), rules).tolist() == [pytest.approx([0, 2.0, 0], abs=1e-9)]
     beam = ((-0.3, -0.3, 1.5), (0.3, 0.3, 2.0))
-    assert nearest_places(hall([beam], height=3.0), looking(0), rules).tolist() == [pytest.approx([0, 0, -1.5])]
+    above = nearest_places(hall([beam], height=3.0), looking(0), rules)
+    assert above[np.argmin(np.linalg.norm(above, axis=1))] == pytest.approx([0, 0, -1.5])
+    assert above[:, 2] == pytest.approx(np.full(len(above), -1.5))
 
 
 def test_unknown_is_an_obstacle_unless_told():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereovox import Mapper, ObstacleSender, StereovoxError, open_source
+from stereovox import Mapper, MapRun, ObstacleSender, StereovoxError, open_source
 from stereovox.mavlink.directions import DirectionRules
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
@@ -53,7 +53,7 @@ def test_an_autopilot_reads_what_the_map_says(start_autopilot, mapped):
     for k, read in enumerate(message["ardupilot"]):
         near = min(reach[j] for j in range(72) if int((5 * j + 22.5) % 360 // 45) == k)
         assert read == (None if near > 4 else pytest.approx(near, abs=0.01))
-    heartbeat = autopilot.wait_for("HEARTBEAT")[0]
+    heartbeat = next(m for m in autopilot.told if m["is"] == "HEARTBEAT")
     assert (heartbeat["type"], heartbeat["autopilot"]) == (18, 8)  # onboard controller, no autopilot
 
 
@@ -90,7 +90,7 @@ def test_a_stale_map_is_not_sent_and_told_once(start_autopilot, mapped, frames):
         silence = [m["is"] for m in autopilot.wait_for("HEARTBEAT") + autopilot.drain()]
         assert "OBSTACLE_DISTANCE" not in silence
         assert sender.sent == sent
-        assert told == ["no obstacle distances are sent: the last trusted frame is 0.60 s old"]
+        assert told == ["no obstacle distances are sent: the last trusted frame of camera is 0.60 s old"]
         again = next(iter(open_source("sim:room", frames="33:34")))
         sender.after(again, mapper.add(again))
         autopilot.wait_for("OBSTACLE_DISTANCE")
@@ -161,26 +161,13 @@ def test_directions_come_as_one_look_round(start_autopilot, mapped):
 
 
 def test_it_observes_a_run(start_autopilot, tmp_path):
-    from stereovox import map_recording
-
-    autopilot, senders = start_autopilot(), []
-
-    class Observer:
-        def after(self, frame, report):
-            senders[0].after(frame, report)
-
-        def finish(self):
-            senders[0].finish()
-
-    source = open_source("sim:room", frames=":20")
-    mapper = Mapper("default", voxel_size=0.1)
-    with ObstacleSender(mapper, autopilot.url, rate_hz=100, max_age_s=60) as sender:
-        senders.append(sender)
-        for frame in source:
-            Observer().after(frame, mapper.add(frame))
-        Observer().finish()
+    autopilot = start_autopilot()
+    with (
+        MapRun("sim:room", tmp_path / "room.svox", frames=":20") as run,
+        ObstacleSender(run.mapper, autopilot.url, rate_hz=100, max_age_s=60) as sender,
+    ):
+        run.finish([sender])
         autopilot.wait_for("OBSTACLE_DISTANCE")
-    assert callable(map_recording)
 
 
 @pytest.mark.parametrize(

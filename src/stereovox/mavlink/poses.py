@@ -7,6 +7,7 @@ north, y west, z up, and the body in optical axes: `turned(T, "ned", "up")` of `
 
 from __future__ import annotations
 
+from collections import deque
 from math import cos, isfinite, sin
 from typing import Any, Protocol
 
@@ -21,6 +22,8 @@ LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
 """MAV_FRAME: the worlds and the body of ODOMETRY that are understood."""
 BODIES = (BODY_FRD, 8)
 """The child frame is that of the velocities, which are not used; 8, MAV_FRAME_BODY_NED, is an older name."""
+ATTITUDES = 16
+"""Last attitudes that are remembered: a position may come before or after the attitudes of its time."""
 LONGEST_GAP_NS = 200_000_000
 """Between two attitudes, one before and one after a position."""
 OLDEST_NS, NEWEST_NS = 2_000_000_000, 50_000_000
@@ -66,7 +69,7 @@ class PoseReceiver:
         self.passed_over: dict[str, int] = {}
         self._resets: int | None = None
         self._last_odometry_ns = self._last_quaternion_ns = -PREFERRED_NS - 1
-        self._attitude: tuple[int, Transform] | None = None
+        self._attitudes: deque[tuple[int, Transform]] = deque(maxlen=ATTITUDES)
         self._position: tuple[int, NDArray[np.float64], int] | None = None
         self._readers = {
             "ODOMETRY": self._odometry,
@@ -111,6 +114,7 @@ class PoseReceiver:
     def _local_position(self, message: Any, came_ns: int) -> None:
         if came_ns - self._last_odometry_ns > PREFERRED_NS:
             self._position = message.time_boot_ms * 1_000_000, np.array([message.x, message.y, message.z]), came_ns
+            self._combine()
 
     def _quaternion(self, message: Any, came_ns: int) -> None:
         self._last_quaternion_ns = came_ns
@@ -122,16 +126,27 @@ class PoseReceiver:
             self._turn(message.time_boot_ms * 1_000_000, _of_angles(message.roll, message.pitch, message.yaw))
 
     def _turn(self, remote_ns: int, T: Transform | None) -> None:
-        """Take an attitude: a position between the last one and this one becomes a pose."""
-        before, self._attitude = self._attitude, None if T is None else (remote_ns, T)
         if T is None:
             return self._pass_over("not finite", "the autopilot sends attitudes that are no rotations")
-        if self._position is None or remote_ns < self._position[0]:
+        if self._attitudes and remote_ns <= self._attitudes[-1][0]:  # started again, or out of order
+            self._attitudes.clear()
+        self._attitudes.append((remote_ns, T))
+        self._combine()
+
+    def _combine(self) -> None:
+        """Make a pose of the position that waits, once there is an attitude of its time or later."""
+        if self._position is None or not self._attitudes or self._attitudes[-1][0] < self._position[0]:
             return
         (at_ns, xyz, came_ns), self._position = self._position, None
-        if before is None or not before[0] <= at_ns <= remote_ns or remote_ns - before[0] > LONGEST_GAP_NS:
+        before = [k for k, (stamp_ns, _) in enumerate(self._attitudes) if stamp_ns <= at_ns]
+        (first_ns, first), (then_ns, then) = (
+            (self._attitudes[k] for k in (before[-1], min(before[-1] + 1, len(self._attitudes) - 1)))
+            if before
+            else ((0, np.eye(4)), (at_ns + LONGEST_GAP_NS, np.eye(4)))
+        )
+        if then_ns - first_ns > LONGEST_GAP_NS:
             return self._pass_over("no attitude", "positions come without an attitude before and after them")
-        pose = interpolate(before[1], T, (at_ns - before[0]) / max(remote_ns - before[0], 1))
+        pose = interpolate(first, then, (at_ns - first_ns) / max(then_ns - first_ns, 1))
         pose[:3, 3] = xyz
         self._hand_on(at_ns, pose, came_ns)
 

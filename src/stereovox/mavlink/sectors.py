@@ -150,7 +150,8 @@ def obstacle_sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: Sector
     states = _states(voxel_map, cell, low, high, rules.oldest_s)
     columns = np.moveaxis(states, upright, (0, 1, 2))
     flat = _Columns(T_world_body[:3, 3], heading, cell, low, upright, columns.shape[:2], rules)
-    obstacle = ((columns == State.OCCUPIED) | (columns == State.TENTATIVE)).any(axis=2)
+    occupied, tentative = (columns == State.OCCUPIED).any(axis=2), (columns == State.TENTATIVE).any(axis=2)
+    obstacle = occupied | (tentative & ~flat.own)
     unknown = (columns == State.UNKNOWN).any(axis=2) & ~flat.own
     return Sectors(flat.nearest(obstacle), flat.nearest(unknown))
 

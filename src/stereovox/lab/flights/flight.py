@@ -183,8 +183,9 @@ class _Loop:
     def run(self) -> Flight:
         """Fly until the end or a collision."""
         setup, now, image, message = self._setup, 0.0, 0.0, 0.0
-        end, collided = TURN_S + setup.seconds, None
-        while now < end and collided is None:
+        steps, collided = round((TURN_S + setup.seconds) / STEP_S), None
+        for step in range(steps):
+            now = step * STEP_S
             if setup.prevention and now >= image:
                 self._under_way.append((now, len(self._under_way), self._quad.T_world_body))
                 image += 1 / setup.camera_hz
@@ -193,8 +194,9 @@ class _Loop:
                 self._tell(now)
                 message += 1 / setup.rate_hz
             collided = self._move(now)
-            now += STEP_S
-        flown = max(now - TURN_S, 0.0)
+            if collided is not None:
+                break
+        flown = max(now + STEP_S - TURN_S, 0.0)
         return Flight(
             self._seed, collided, flown, self._metres, self._asked, self._least, self._top, self._refused, self._frames
         )

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from stereovox.products.distance import DistanceField as DistanceField
     from stereovox.products.frontiers import frontiers as frontiers
     from stereovox.products.ground import ground as ground
+    from stereovox.products.level_ways import LevelWays as LevelWays
     from stereovox.products.path_check import check_path as check_path
     from stereovox.rebuild import CorrectionReport as CorrectionReport
     from stereovox.remapping import Remapped as Remapped
@@ -121,6 +122,7 @@ _HOMES = {
     "export": "formats",
     "import_map": "formats",
     "DistanceField": "products.distance",
+    "LevelWays": "products.level_ways",
     "check_path": "products.path_check",
     "coarsen": "products.coarsen",
     "crop": "products.crop",

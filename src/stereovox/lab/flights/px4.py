@@ -35,7 +35,7 @@ class Parameters:
         mpc_acc_hor: MPC_ACC_HOR, m/s^2.
     """
 
-    cp_dist: float = 0.6
+    cp_dist: float = 0.5
     cp_delay: float = 0.4
     cp_guide_ang: float = 30.0
     mpc_xy_p: float = 0.95

@@ -57,6 +57,13 @@ if TYPE_CHECKING:
     from stereovox.maps import save_boxed as save_boxed
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.mavlink.directions import DirectionRules as DirectionRules
+    from stereovox.mavlink.link import MavlinkLink as MavlinkLink
+    from stereovox.mavlink.poses import PoseReceiver as PoseReceiver
+    from stereovox.mavlink.poses import receive_poses as receive_poses
+    from stereovox.mavlink.sectors import SectorRules as SectorRules
+    from stereovox.mavlink.sectors import obstacle_sectors as obstacle_sectors
+    from stereovox.mavlink.sending import ObstacleSender as ObstacleSender
     from stereovox.opening import open_images as open_images
     from stereovox.opening import open_source as open_source
     from stereovox.products.coarsen import coarsen as coarsen
@@ -65,6 +72,7 @@ if TYPE_CHECKING:
     from stereovox.products.distance import DistanceField as DistanceField
     from stereovox.products.frontiers import frontiers as frontiers
     from stereovox.products.ground import ground as ground
+    from stereovox.products.level_ways import LevelWays as LevelWays
     from stereovox.products.path_check import check_path as check_path
     from stereovox.rebuild import CorrectionReport as CorrectionReport
     from stereovox.remapping import Remapped as Remapped
@@ -122,6 +130,7 @@ _HOMES = {
     "export": "formats",
     "import_map": "formats",
     "DistanceField": "products.distance",
+    "LevelWays": "products.level_ways",
     "check_path": "products.path_check",
     "coarsen": "products.coarsen",
     "crop": "products.crop",
@@ -154,6 +163,13 @@ _HOMES = {
     "map_fleet": "fleet",
     "plan_fleet": "fleet",
     "score_fleet": "fleet",
+    "DirectionRules": "mavlink.directions",
+    "MavlinkLink": "mavlink.link",
+    "PoseReceiver": "mavlink.poses",
+    "receive_poses": "mavlink.poses",
+    "SectorRules": "mavlink.sectors",
+    "obstacle_sectors": "mavlink.sectors",
+    "ObstacleSender": "mavlink.sending",
     "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",

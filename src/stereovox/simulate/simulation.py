@@ -37,6 +37,7 @@ SCENES = {
     "loop": "stereovox.simulate.loop:stage",
     "offices": "stereovox.simulate.offices:stage",
     "racks": "stereovox.simulate.racks:stage",
+    "hall": "stereovox.simulate.hall:stage",
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")
@@ -110,6 +111,7 @@ class Simulation(DepthSource):
         sim:town?blocks=6&drive=0&length=120        streets with houses, lamps, trees and cars; a drive through them
         sim:loop?length=60&laps=2&plan=0           a ring of corridors, walked round several times
         sim:offices?offices=8&visits=10&walk=0      a corridor with offices of one kind, some visited again
+        sim:hall?plan=0                             a hall at random, with pillars, posts, boxes and lamps
 
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
@@ -179,18 +181,42 @@ class Simulation(DepthSource):
 
     def observe(self, i: int, true_depth_m: NDArray[np.float32]) -> Frame:
         """Return what the camera delivers as frame `i` where `true_depth_m` is the exact depth (height, width)."""
+        T_world_camera = self._world.path(self._share(i))
+        name = f"{self.name} frame {i}"
+        return self._taken(true_depth_m, i, T_world_camera, self.pose(i), i * self.period_ns, name, self._photo(i))
+
+    def frame_from(
+        self, T_world_camera: Transform, number: int, stamp_ns: int, T_reported: Transform | None = None
+    ) -> Frame:
+        """Return what the camera delivers anywhere off its way, world z up.
+
+        T_world_camera: (4, 4), where it is. number: another one has other noise. T_reported: the pose that the frame
+        comes with; None: the true one.
+        """
+        reported = T_world_camera if T_reported is None else T_reported
+        depth_m = self._cast(T_world_camera)
+        return self._taken(depth_m, number, T_world_camera, reported, stamp_ns, f"{self.name} look {number}", None)
+
+    def _taken(
+        self,
+        true_depth_m: NDArray[np.float32],
+        number: int,
+        T_world_camera: Transform,
+        T_reported: Transform,
+        stamp_ns: int,
+        name: str,
+        photo: Photo | None,
+    ) -> Frame:
         if self.noise:
-            T_world_camera = self._world.path(self._share(i))
-            depth, reason = self.device.measure(true_depth_m, [self.seed, i], T_world_camera)
+            depth, reason = self.device.measure(true_depth_m, [self.seed, number], T_world_camera)
             scale = 0.001
         else:
             depth, scale = self.device.distorted(true_depth_m), 1.0
             reason = classify(depth, self.device.nearest, self.device.farthest)
             depth = np.where(reason == Reason.VALID, depth, np.float32(0))
         return Frame(
-            depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}",
-            farthest=self.device.farthest, photo=self._photo(i),
-        )  # fmt: skip
+            depth, self.camera, T_reported, stamp_ns, scale, reason, name, farthest=self.device.farthest, photo=photo
+        )
 
     def _photo(self, i: int) -> Photo | None:
         """Return the grey image of frame `i`, taken once it is needed; None where none is asked for."""

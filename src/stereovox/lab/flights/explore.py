@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Missions of a simulated quadrotor that nobody steers: find the middle of a room and look round, and explore a hall.
+
+Each goal is reached by a way that is known to be free, and the vehicle looks where it flies; while it flies, the way
+ahead is checked against the newest map, and it stops and plans again where that is not free any more.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass, field
+from math import inf
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.lab.flights.flight import STEP_S, World
+from stereovox.mapper import Mapper
+from stereovox.maps import State, VoxelMap
+from stereovox.products.frontiers import frontiers
+from stereovox.products.level_ways import LevelWays
+from stereovox.products.path_check import check_path, point_along
+from stereovox.se3 import Transform
+from stereovox.simulate.quadrotor import Airframe, Quadrotor
+
+LOOK_S = 8.0
+"""Seconds of a turn on the spot."""
+ARRIVED, AHEAD = 0.15, 0.5
+"""Metres from the end of a way at which it is done, and from the vehicle to where on its way it steers."""
+CHECK_M, CHECK_S = 1.0, 0.2
+"""Metres of the way that are checked, and how often."""
+FACING = 0.5
+"""It flies once it looks along its way to within so many radians."""
+SEEN_AGAIN = 0.6
+"""A frontier within so many metres of one that was looked at brings nothing."""
+
+
+@dataclass(frozen=True)
+class Cruise:
+    """How a mission is flown.
+
+    Attributes:
+        scene: Simulation; `{seed}` in it stands for the flight's seed.
+        seconds: Longest time of a mission.
+        speed: m/s along ways.
+        turn: Radians a second.
+        voxel_size: Of the map, metres.
+        camera_hz: Images a second.
+        delay_s: From the image to the map.
+        margin: Metres between the propellers and what is not known to be free.
+        half_height: Metres above and below the vehicle that must be free.
+        own_radius: As in `SectorRules`.
+        airframe: The quadrotor.
+    """
+
+    scene: str = "sim:hall?plan={seed}"
+    seconds: float = 300.0
+    speed: float = 0.6
+    turn: float = 1.0
+    voxel_size: float = 0.1
+    camera_hz: float = 10.0
+    delay_s: float = 0.06
+    margin: float = 0.1
+    half_height: float = 0.3
+    own_radius: float = 0.75
+    airframe: Airframe = field(default_factory=Airframe)
+
+    @property
+    def radius(self) -> float:
+        """Radius of the ball whose way must be free."""
+        return self.airframe.radius + self.margin
+
+
+class Mission(Protocol):
+    """What chooses goals."""
+
+    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return a way (N, 3) and the place (3,) to look at from its end, NaN to look all round; None: it is done."""
+        ...
+
+
+class MiddleOfRoom:
+    """Find the middle of a room and look round there, until it is where it was thought to be."""
+
+    def __init__(self, looks: int = 3):
+        self._left, self._last = looks, np.full(3, inf)
+        self.room_m = 0.0
+
+    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the way to the middle as it is known by now."""
+        found = ways.middle()
+        if found is None or not self._left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
+            return None
+        (self._last, self.room_m), self._left = found, self._left - 1
+        way = ways.way_to(self._last)
+        return None if way is None else (way, np.full(3, np.nan))
+
+
+class Frontiers:
+    """Explore: go to the frontier that is nearest along the way and look at it, until none can be come to."""
+
+    def __init__(self, smallest: int = 15, band: float = 0.6):
+        self._smallest, self._band = smallest, band
+        self._looked_at: list[NDArray[np.float64]] = []
+
+    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the way to where the nearest frontier is seen from."""
+        height = ways.start[2]
+        found = frontiers(
+            voxel_map, self._smallest, heights=(height - self._band, height + self._band), start=ways.start, radius=0.2
+        )
+        best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        for one in found:
+            if one.look_from is None or any(
+                np.linalg.norm(one.centroid - done) < SEEN_AGAIN for done in self._looked_at
+            ):
+                continue
+            way = ways.way_to(one.look_from, near=0.5)
+            if way is not None and (best is None or _length(way) < _length(best[0])):
+                best = way, one.centroid
+        if best is not None:
+            self._looked_at.append(best[1])
+        return best
+
+
+@dataclass(frozen=True)
+class Explored:
+    """What became of a mission.
+
+    Attributes:
+        seed: Of hall, start and noise.
+        collided_s: Second at which a propeller touched something; None: it did not.
+        seconds: How long it flew.
+        done: Whether the mission ended by itself.
+        metres: How far it flew.
+        goals: How many ways it flew, or began to.
+        clearance_m: Least distance between its middle and a surface.
+        coverage: (seconds, share of the hall's air that is known to be free) every ten seconds.
+        place: (3,) metres, where it ended.
+    """
+
+    seed: int
+    collided_s: float | None
+    seconds: float
+    done: bool
+    metres: float
+    goals: int
+    clearance_m: float
+    coverage: list[tuple[float, float]]
+    place: list[float]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all values as plain types for JSON."""
+        return asdict(self)
+
+
+def explore(seed: int, mission: Mission, cruise: Cruise | None = None, world: World | None = None) -> Explored:
+    """Fly a mission.
+
+    Args:
+        seed: Of hall, start and noise.
+        mission: What chooses goals.
+        cruise: How it is flown; by default `Cruise()`.
+        world: The scene, if it is made already.
+
+    Returns:
+        What became of it.
+    """
+    cruise = cruise or Cruise()
+    return _Mission(seed, mission, cruise, world or World(cruise.scene.format(seed=seed))).run()
+
+
+class _Mission:
+    """The parts of a mission and the times at which they act."""
+
+    def __init__(self, seed: int, mission: Mission, cruise: Cruise, world: World):
+        self._seed, self._mission, self._cruise, self._world = seed, mission, cruise, world
+        draw = np.random.default_rng([seed, 1])
+        place = world.start(draw)
+        self._quad = Quadrotor(place, draw.uniform(-np.pi, np.pi), cruise.airframe)
+        self._height = float(place[2])
+        self._mapper = Mapper("default", voxel_size=cruise.voxel_size)
+        self._air = Air(world, cruise.voxel_size)
+        self._under_way: deque[tuple[float, Transform]] = deque()
+        self._images = self._goals = 0
+        self._way: NDArray[np.float64] | None = None
+        self._look_at = np.full(3, np.nan)
+        self._look_left = 2 * np.pi
+        self._checked = 0.0
+
+    def run(self) -> Explored:
+        """Fly until the mission is done, time is up, or a collision."""
+        metres, least, collided, done, coverage, now = 0.0, inf, None, False, [], 0.0
+        for step in range(round(self._cruise.seconds / STEP_S)):
+            now = step * STEP_S
+            self._see(now)
+            if not step % round(10 / STEP_S):
+                coverage.append((now, self._air.known(self._mapper.map)))
+            if self._way is None and self._look_left <= 0 and not self._choose():
+                done = True
+                break
+            before = self._quad.position.copy()
+            self._steer(now)
+            metres += float(np.linalg.norm(self._quad.position - before))
+            room = self._world.clearance.at(self._quad.position, 2.0)
+            least = min(least, room)
+            if room < self._quad.frame.radius:
+                collided = now
+                break
+        coverage.append((now, self._air.known(self._mapper.map)))
+        place = self._quad.position.tolist()
+        return Explored(self._seed, collided, now, done, metres, self._goals, least, coverage, place)
+
+    def _see(self, now: float) -> None:
+        """Take an image where one is due, and put those into the map that were taken long enough ago."""
+        if now >= self._images / self._cruise.camera_hz:
+            self._under_way.append((now, self._quad.T_world_body))
+            self._images += 1
+        while self._under_way and now >= self._under_way[0][0] + self._cruise.delay_s:
+            taken, T = self._under_way.popleft()
+            number = self._seed * 1_000_000 + round(taken * 1000)
+            self._mapper.add(self._world.camera.frame_from(T, number, round(1e9 * taken)))
+
+    def _choose(self) -> bool:
+        """Choose the next way; return whether there is one."""
+        cruise = self._cruise
+        here = np.array([*self._quad.position[:2], self._height])
+        ways = LevelWays(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
+        found = self._mission.next(self._mapper.map, ways)
+        if found is None:
+            return False
+        (self._way, self._look_at), self._goals = found, self._goals + 1
+        return True
+
+    def _steer(self, now: float) -> None:
+        """Fly one step along the way, or turn."""
+        quad, cruise = self._quad, self._cruise
+        if self._way is None:
+            rate = self._turning()
+            quad.step(np.zeros(2), self._height, rate, STEP_S)
+            return
+        along = _passed(self._way, quad.position)
+        target = point_along(self._way, along + AHEAD)
+        off = _turn(quad.yaw, target - quad.position)
+        rate = float(np.clip(2 * off, -cruise.turn, cruise.turn))
+        if _length(self._way) - along < ARRIVED or not self._free_ahead(now, along):
+            self._way, rate = None, 0.0
+            self._look_left = 2 * np.pi if np.isnan(self._look_at).any() else 1.0
+        flown = np.zeros(2)
+        if self._way is not None and abs(off) < FACING:
+            step = (target - quad.position)[:2]
+            flown = step / max(float(np.linalg.norm(step)), 1e-9) * min(cruise.speed, _length(self._way) - along + 0.1)
+        quad.step(flown, self._height, rate, STEP_S)
+
+    def _turning(self) -> float:
+        """Return the rate of a turn all round, or towards a place that is held for a second."""
+        if np.isnan(self._look_at).any():
+            rate = 2 * np.pi / LOOK_S
+            self._look_left -= rate * STEP_S
+            return rate
+        off = _turn(self._quad.yaw, self._look_at - self._quad.position)
+        if abs(off) < 0.2:
+            self._look_left -= STEP_S
+        return float(np.clip(2 * off, -self._cruise.turn, self._cruise.turn))
+
+    def _free_ahead(self, now: float, along: float) -> bool:
+        """Return whether the next metre of the way is free by the newest map, but for the vehicle's own place."""
+        if self._way is None or now - self._checked < CHECK_S:
+            return True
+        self._checked, cruise = now, self._cruise
+        start, end = along + cruise.own_radius, min(along + cruise.own_radius + CHECK_M, _length(self._way))
+        if end <= start:
+            return True
+        places = [point_along(self._way, metres) for metres in np.linspace(start, end, 6)]
+        return check_path(self._mapper.map, places, cruise.airframe.radius).free
+
+
+class Air:
+    """The cells of a hall that touch nothing."""
+
+    def __init__(self, world: World, cell: float):
+        scene = world.camera.scene
+        walls = [solid.bounds for solid in scene.part("walls")]
+        low = np.array([walls[0][1, 0], walls[2][1, 1], scene.part("floor")[0].bounds[1, 2]])
+        high = np.array([walls[1][0, 0], walls[3][0, 1], scene.part("ceiling")[0].bounds[0, 2]])
+        first, last = np.ceil(low / cell).astype(int), np.floor(high / cell).astype(int)
+        centres = (np.indices(tuple(last - first)).reshape(3, -1).T + first + 0.5) * cell
+        inside = [solid for solid in scene.solids if solid.part not in ("walls", "floor", "ceiling")]
+        touched = np.zeros(len(centres), bool)
+        for solid in inside:
+            touched |= solid.contains(centres, 0.6 * cell)
+        self._air = centres[~touched]
+
+    def known(self, voxel_map: VoxelMap) -> float:
+        """Return the share of the air that the map knows to be free."""
+        return float((voxel_map.state(self._air) == State.FREE).mean())
+
+
+def _length(way: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+
+
+def _passed(way: NDArray[np.float64], place: NDArray[np.float64]) -> float:
+    """Return how far along a way the point of it is that is nearest to a place."""
+    a, b = way[:-1, :2], way[1:, :2]
+    share = ((place[:2] - a) * (b - a)).sum(axis=1) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-12)
+    share = np.clip(share, 0, 1)
+    near = int(np.argmin(np.linalg.norm(a + share[:, None] * (b - a) - place[:2], axis=1)))
+    lengths = np.linalg.norm(b - a, axis=1)
+    return float(lengths[:near].sum() + share[near] * lengths[near])
+
+
+def _turn(yaw: float, towards: NDArray[np.float64]) -> float:
+    """Return the turn to the left from a yaw to a direction, -pi to pi."""
+    return float((np.arctan2(towards[1], towards[0]) - yaw + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an autopilot's clock shows, by this machine's: TIMESYNC messages, or else the least delay of what it sends.
+
+TIMESYNC (https://mavlink.io/en/services/timesync.html): we send our time ts1, the autopilot returns it beside its own,
+tc1; if both ways take as long, its clock was ahead of ours by tc1 - (ts1 + now) / 2, as in PX4's mavlink_timesync.cpp.
+Of the last answers the one with the shortest round trip counts, whose error is at most half of that.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from threading import Lock
+
+ANSWERS = 32
+"""Last answers to TIMESYNC that are remembered."""
+HEARD = 200
+"""Last messages whose delay is remembered."""
+ENOUGH = 20
+"""Messages that must have come before the least of their delays is believed."""
+LONGEST_ROUND_TRIP_NS = 100_000_000
+"""Answers that took longer are passed over."""
+STARTED_AGAIN_NS = 1_000_000_000
+"""A clock that goes back by more was started anew."""
+
+
+class RemoteClock:
+    """Turns times of another machine into this one's. Threads may share it.
+
+    Without TIMESYNC, times come out late by the least delay of the link, which is not known.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._forget()
+
+    def answered(self, sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Take an answer to TIMESYNC.
+
+        Args:
+            sent_ns: When it was asked, by this machine (`ts1`).
+            remote_ns: When the other one answered, by its clock (`tc1`).
+            received_ns: When the answer came, by this machine.
+        """
+        round_trip_ns = received_ns - sent_ns
+        if not 0 <= round_trip_ns <= LONGEST_ROUND_TRIP_NS:
+            return
+        with self._lock:
+            self._latest_answer_ns = self._checked(remote_ns, self._latest_answer_ns)
+            self._answers.append((round_trip_ns, remote_ns - (sent_ns + received_ns) // 2))
+
+    def heard(self, remote_ns: int, received_ns: int) -> None:
+        """Take the time that a message brings, in the other machine's nanoseconds, and when it came, in this one's."""
+        with self._lock:
+            self._latest_heard_ns = self._checked(remote_ns, self._latest_heard_ns)
+            self._heard.append(remote_ns - received_ns)
+
+    @property
+    def offset_ns(self) -> int | None:
+        """How far the other clock is ahead of this one; None while too little is known."""
+        with self._lock:
+            if self._answers:
+                return min(self._answers)[1]
+            return max(self._heard) if len(self._heard) >= ENOUGH else None
+
+    @property
+    def error_ns(self) -> int | None:
+        """The most by which `offset_ns` is off; None where nobody knows, without TIMESYNC."""
+        with self._lock:
+            return min(self._answers)[0] // 2 if self._answers else None
+
+    def local_ns(self, remote_ns: int) -> int | None:
+        """Return a time of the other machine in this one's nanoseconds; None while too little is known."""
+        offset = self.offset_ns
+        return None if offset is None else remote_ns - offset
+
+    def _checked(self, remote_ns: int, latest_ns: int) -> int:
+        """Return the latest time of the other clock; one that was started again is a new clock."""
+        if remote_ns < latest_ns - STARTED_AGAIN_NS:
+            self._forget()
+            return remote_ns
+        return max(latest_ns, remote_ns)
+
+    def _forget(self) -> None:
+        self._latest_answer_ns = self._latest_heard_ns = 0
+        self._answers: deque[tuple[int, int]] = deque(maxlen=ANSWERS)
+        self._heard: deque[int] = deque(maxlen=HEARD)

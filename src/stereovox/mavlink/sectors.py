@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What MAVLink's OBSTACLE_DISTANCE says of a map: how far 72 sectors round a vehicle are known to be free.
+
+The message (https://mavlink.io/en/messages/common.html#OBSTACLE_DISTANCE): whole centimetres; element i lies at
+`angle_offset + i * increment` degrees, clockwise seen from above, from the vehicle's front in MAV_FRAME_BODY_FRD;
+`max_distance + 1` says that there is no obstacle, UINT16_MAX that nothing is known. What its readers make of it decides
+how it is filled here:
+
+- PX4 up to 1.15 has sectors of 10 degrees and takes element `ceil(angle / increment)` for each, every second one of 72
+  (CollisionPrevention.cpp, `_addObstacleSensorData`). Elements therefore overlap (`overlap_deg`).
+- PX4 does not look at elements up to `min_distance`, and ArduPilot neither at these nor at 0 (AP_Proximity_MAV.cpp,
+  `handle_obstacle_distance_msg`): what is nearest would count as nothing. `min_distance` is therefore 0 and an obstacle
+  that touches the vehicle at 1 cm.
+- UINT16_MAX leaves PX4's sector as it was for up to 0.5 s, during which the vehicle may turn; then it does not fly
+  there (`CP_GO_NO_DATA` = 0). ArduPilot takes it for free. The default is therefore to say where the unknown begins, as
+  if an obstacle stood there; both stop before it.
+- PX4 turns elements by the vehicle's yaw only, so sectors are level, whatever its roll and pitch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor, inf
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.products.floor_axes import up_of, upright_axes
+from stereovox.se3 import Transform, rigidity_error
+
+SECTORS = 72
+INCREMENT_DEG = 360 / SECTORS
+UNKNOWN = 0xFFFF
+"""UINT16_MAX: nothing is known."""
+NEAREST_CM = 1
+"""Least distance that is sent: 0 is passed over by ArduPilot, and by PX4 where it is `min_distance`."""
+MAX_CELLS = 20_000_000
+"""Cells that are looked at for one message."""
+LEVEL_ERROR = 0.02
+"""Length by which the map's `up` may miss its true direction (1.1 degrees)."""
+STEEPEST = 0.1
+"""Least horizontal length of the forward axis, a unit vector: 84 degrees of pitch."""
+UnknownAs = Literal["obstacle", "unmeasured"]
+
+
+@dataclass(frozen=True)
+class SectorRules:
+    """How a map is read for sectors.
+
+    Attributes:
+        max_distance: Horizontal metres up to which cells are looked at, at most 655.
+        half_height: Metres above and below the body's origin within which cells count.
+        overlap_deg: Degrees by which each sector reaches into its neighbours on either side, 0 to 45.
+        own_radius: Horizontal metres about the body within which unknown cells are taken for the vehicle's own place.
+            A camera does not see them before take-off; later none comes as near without being known, since the
+            vehicle stops before the unknown. What is known to be occupied there counts.
+        oldest_s: Free cells whose last evidence is older count as unknown (needs `map.keep_times`); infinite: none.
+        unknown: What stands for unknown space before an obstacle: `obstacle`, the distance at which it begins;
+            `unmeasured`, UINT16_MAX.
+
+    Raises:
+        StereovoxError: A value is out of range.
+    """
+
+    max_distance: float = 5.0
+    half_height: float = 0.3
+    overlap_deg: float = 5.0
+    own_radius: float = 0.5
+    oldest_s: float = inf
+    unknown: UnknownAs = "obstacle"
+
+    def __post_init__(self) -> None:
+        _check("max_distance", self.max_distance, 0.1, 655)
+        _check("half_height", self.half_height, 0, 100)
+        _check("overlap_deg", self.overlap_deg, 0, 45)
+        _check("own_radius", self.own_radius, 0, self.max_distance)
+        _check("oldest_s", self.oldest_s, 0, inf)
+        if self.unknown not in get_args(UnknownAs):
+            raise StereovoxError(f"unknown '{self.unknown}': use {' or '.join(get_args(UnknownAs))}")
+
+    @property
+    def max_cm(self) -> int:
+        """`max_distance` of the message, in whole centimetres."""
+        return floor(100 * self.max_distance + 1e-6)
+
+
+class Sectors(NamedTuple):
+    """What a map says about sectors. Sector i is centred at 5 i degrees clockwise of the vehicle's front.
+
+    Attributes:
+        obstacle_m: (72,) float64 horizontal metres from the body's origin to the nearest cell that is occupied or
+            tentative; infinite: none up to `max_distance`.
+        unknown_m: (72,) float64 the same for unknown cells.
+    """
+
+    obstacle_m: NDArray[np.float64]
+    unknown_m: NDArray[np.float64]
+
+    @property
+    def free_m(self) -> NDArray[np.float64]:
+        """(72,) float64 metres up to which everything is known to be free; infinite: up to `max_distance`."""
+        return np.minimum(self.obstacle_m, self.unknown_m)
+
+    def centimetres(self, rules: SectorRules) -> NDArray[np.uint16]:
+        """Return the message's `distances` (72,), rounded down.
+
+        Args:
+            rules: Those that the sectors were made with.
+        """
+        free_m = self.free_m
+        whole = np.floor(100 * np.minimum(free_m, rules.max_distance) + 1e-6)
+        cm = np.where(np.isinf(free_m), rules.max_cm + 1, np.clip(whole, NEAREST_CM, rules.max_cm))
+        if rules.unknown == "unmeasured":
+            cm[self.unknown_m < self.obstacle_m] = UNKNOWN
+        return cm.astype(np.uint16)
+
+
+class Heading(NamedTuple):
+    """The horizontal plane through a body. axes: (3, 3) rows x, y and up as directions in the world."""
+
+    axes: NDArray[np.float64]
+    forward: NDArray[np.float64]
+    """(2,) unit vector, x and y."""
+
+
+def obstacle_sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: SectorRules | None = None) -> Sectors:
+    """Return how far the sectors round a body are known to be free.
+
+    A cell counts in all sectors that it reaches into, with the distance of its nearest point.
+
+    Args:
+        voxel_map: The map, with `up` along one of its axes.
+        T_world_body: (4, 4) maps the body (optical axes: x right, y down, z forward) into the world.
+        rules: What is looked at; by default `SectorRules()`.
+
+    Returns:
+        The nearest obstacle and the nearest unknown of each sector.
+
+    Raises:
+        StereovoxError: The pose is no rigid motion or looks straight up or down, the map is tilted, or there are too
+            many cells to look at.
+    """
+    rules = rules or SectorRules()
+    heading, cell = heading_of(voxel_map, T_world_body), np.asarray(voxel_map.config.cell)
+    upright = [int(np.argmax(np.abs(axis))) for axis in heading.axes]
+    low, high = _spans(T_world_body[:3, 3], cell, upright, rules)
+    states = _states(voxel_map, cell, low, high, rules.oldest_s)
+    columns = np.moveaxis(states, upright, (0, 1, 2))
+    flat = _Columns(T_world_body[:3, 3], heading, cell, low, upright, columns.shape[:2], rules)
+    occupied, tentative = (columns == State.OCCUPIED).any(axis=2), (columns == State.TENTATIVE).any(axis=2)
+    obstacle = occupied | (tentative & ~flat.own)
+    unknown = (columns == State.UNKNOWN).any(axis=2) & ~flat.own
+    return Sectors(flat.nearest(obstacle), flat.nearest(unknown))
+
+
+def heading_of(voxel_map: VoxelMap, T_world_body: Transform) -> Heading:
+    """Return where a body looks in the map's horizontal plane; raises StereovoxError as `obstacle_sectors` does."""
+    if not rigidity_error(T_world_body) < 1e-3:
+        raise StereovoxError("T_world_body is no rigid motion (4, 4); give a rotation and metres")
+    axes = upright_axes(voxel_map.config.up)
+    if np.linalg.norm(up_of(voxel_map.config) - axes[2]) > LEVEL_ERROR:
+        raise StereovoxError("the map's world is tilted, so no height is level in it; map with --level")
+    forward = axes[:2] @ T_world_body[:3, 2]
+    length = float(np.linalg.norm(forward))
+    if length < STEEPEST:
+        raise StereovoxError("the body looks straight up or down and has no heading; is its mount right?")
+    return Heading(axes, forward / length)
+
+
+class _Columns:
+    """Columns of cells as they lie round a body: distance and bearings of each, all (n, m)."""
+
+    def __init__(
+        self,
+        origin: NDArray[np.float64],
+        heading: Heading,
+        cell: NDArray[np.float64],
+        low: NDArray[np.int64],
+        upright: list[int],
+        shape: tuple[int, ...],
+        rules: SectorRules,
+    ):
+        here, faces = heading.axes[:2] @ origin, []
+        for axis, number in enumerate(shape):
+            edges = (low[upright[axis]] + np.arange(number + 1)) * cell[upright[axis]] - here[axis]
+            faces.append(np.stack([edges[:-1], edges[1:]]))
+        x, y = faces[0][:, :, None], faces[1][:, None, :]
+        nearest = [np.maximum(np.maximum(side[0], -side[1]), 0) for side in (x, y)]
+        self._away = np.hypot(*nearest)
+        self._x, self._y, self._forward = x, y, heading.forward
+        self._within = self._away <= rules.max_distance
+        self._half_deg = INCREMENT_DEG / 2 + rules.overlap_deg
+        self.own = np.hypot(x.mean(axis=0), y.mean(axis=0)) <= rules.own_radius
+
+    def nearest(self, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the distance (72,) of the nearest chosen column in each sector, infinite where there is none."""
+        row, column = np.nonzero(chosen & self._within)
+        away = self._away[row, column]
+        first, last = self._reach(row, column)
+        first[away == 0], last[away == 0] = 0, SECTORS - 1  # all round
+        found = np.full(SECTORS, inf)
+        for step in range(int((last - first).max(initial=-1)) + 1):
+            reached = first + step <= last
+            np.minimum.at(found, (first + step)[reached] % SECTORS, away[reached])
+        return found
+
+    def _reach(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first and last sector, not wrapped, that columns reach into."""
+        x, y = self._x[:, row, 0], self._y[:, 0, column]
+        middle = self._bearing_deg(x.mean(axis=0), y.mean(axis=0))
+        corners = np.stack([self._bearing_deg(x[i], y[j]) for i in (0, 1) for j in (0, 1)])
+        off = (corners - middle + 180) % 360 - 180
+        first = np.ceil((middle + off.min(axis=0) - self._half_deg) / INCREMENT_DEG - 1e-9)
+        last = np.floor((middle + off.max(axis=0) + self._half_deg) / INCREMENT_DEG + 1e-9)
+        return first.astype(np.int64), np.minimum(last, first + SECTORS - 1).astype(np.int64)
+
+    def _bearing_deg(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return degrees clockwise of the front, seen from above."""
+        ahead, left = self._forward @ np.stack([x, y]), self._forward @ np.stack([y, -x])
+        return np.degrees(np.arctan2(-left, ahead))
+
+
+def _spans(
+    origin: NDArray[np.float64], cell: NDArray[np.float64], upright: list[int], rules: SectorRules
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the lowest and highest cell (3,) that is looked at, in the map's axes."""
+    reach = np.full(3, rules.max_distance)
+    reach[upright[2]] = rules.half_height
+    low = np.floor((origin - reach) / cell).astype(np.int64)
+    high = np.floor((origin + reach) / cell).astype(np.int64)
+    check_number_of_cells(low, high)
+    return low, high
+
+
+def check_number_of_cells(low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+    """Raise StereovoxError where a box of cells is too large to be looked at for each message."""
+    number = np.prod((high - low + 1).astype(float))
+    if number > MAX_CELLS:
+        raise StereovoxError(f"{number:.0f} cells for one message; lessen max_distance, or map with larger cells")
+
+
+def _states(
+    voxel_map: VoxelMap, cell: NDArray[np.float64], low: NDArray[np.int64], high: NDArray[np.int64], oldest_s: float
+) -> NDArray[np.uint8]:
+    """Return the states (i, j, k) of a box of cells."""
+    shape = tuple(high - low + 1)
+    centres = np.empty((*shape, 3))
+    for axis in range(3):
+        line = (low[axis] + np.arange(shape[axis]) + 0.5) * cell[axis]
+        centres[..., axis] = line.reshape([-1 if other == axis else 1 for other in range(3)])
+    return states_of(voxel_map, centres.reshape(-1, 3), oldest_s).reshape(shape)
+
+
+def states_of(voxel_map: VoxelMap, points: NDArray[np.float64], oldest_s: float) -> NDArray[np.uint8]:
+    """Return the states (N,) of points (N, 3); free ones whose evidence is older than `oldest_s` are unknown."""
+    with voxel_map.lock:
+        states = voxel_map.state(points)
+        if oldest_s < inf:
+            free = np.flatnonzero(states == State.FREE)
+            states[free[~(voxel_map.age(points[free]) <= oldest_s)]] = State.UNKNOWN
+    return states
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise StereovoxError(f"{name} {value:g}: give a number from {low:g} to {high:g}")

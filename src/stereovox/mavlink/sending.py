@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Obstacle distances of a growing map for an autopilot, at a steady rate, and none once the map is stale."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from stereovox.errors import StereovoxError
+from stereovox.frame import AnyFrame, UpdateReport
+from stereovox.mapper import Mapper
+from stereovox.mavlink.directions import DirectionRules, nearest_places
+from stereovox.mavlink.link import MavlinkLink, Tell, warn
+from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
+
+HIGHEST_RATE_HZ = 200.0
+PATIENCE = 0.5
+"""Share of a period for which a message waits for the next frame."""
+
+
+class ObstacleSender:
+    """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D where that is asked for.
+
+    It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own
+    reads the map; each message is for the pose of the last frame that the map took in, and waits up to half a period
+    for the next one. Nothing is sent before the first, and nothing once the camera that is silent longest has been so
+    for `max_age_s`: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as failed.
+
+    `time_usec` and `time_boot_ms` are when that last frame arrived, by this machine's clock, which the autopilot may
+    ask for (TIMESYNC).
+
+    Args:
+        mapper: The mapper whose map is sent.
+        connection: A `MavlinkLink`, or the address of one, which is then closed with the sender.
+        rate_hz: Messages a second. PX4 was tested with 10.
+        max_age_s: Seconds since the last frame after which nothing is sent.
+        rules: What OBSTACLE_DISTANCE says; by default `SectorRules()`.
+        directions: What OBSTACLE_DISTANCE_3D says; None: it is not sent.
+        mounts: T_body_sensor (4, 4) by the name of the sensor: maps a camera's optical frame into the body in optical
+            axes (x right, y down, z forward). A camera that is not named looks ahead from the body's origin.
+        tell: Called with one line when sending stops, why, and when it goes on.
+
+    Attributes:
+        sent: Number of OBSTACLE_DISTANCE messages so far.
+        link: The connection.
+
+    Raises:
+        StereovoxError: A value is out of range, a mount is no rigid motion, or as for `MavlinkLink`.
+    """
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        connection: str | MavlinkLink,
+        *,
+        rate_hz: float = 10.0,
+        max_age_s: float = 0.5,
+        rules: SectorRules | None = None,
+        directions: DirectionRules | None = None,
+        mounts: Mapping[str, Transform] | None = None,
+        tell: Tell = warn,
+    ):
+        if not 0.1 <= rate_hz <= HIGHEST_RATE_HZ:
+            raise StereovoxError(f"rate_hz {rate_hz:g}: give 0.1 to {HIGHEST_RATE_HZ:g} messages a second")
+        if not 0 < max_age_s <= 60:
+            raise StereovoxError(f"max_age_s {max_age_s:g}: give seconds above 0, at most 60")
+        self._mapper, self._rules, self._directions = mapper, rules or SectorRules(), directions
+        self._mounts = _checked_mounts(mounts or {})
+        self._period_s, self._max_age_s, self._tell = 1 / rate_hz, max_age_s, tell
+        self._own = isinstance(connection, str)
+        self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
+        self.sent = 0
+        self._T_world_body: Transform | None = None
+        self._why, self._new, self._stopped = "", threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="stereovox-obstacles", daemon=True)
+        self._thread.start()
+
+    def after(self, frame: AnyFrame, report: UpdateReport) -> None:
+        """Take the pose of a frame that the map took in.
+
+        Args:
+            frame: The frame that was offered to the mapper.
+            report: What `Mapper.add` returned for it.
+        """
+        if report.refused is not None:
+            return
+        mount = self._mounts.get(frame.sensor)
+        T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
+        self._T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
+        self._new.set()
+
+    def finish(self) -> None:
+        """Do nothing: what is sent ends when it is stale, or with `close`."""
+
+    def close(self) -> None:
+        """Stop sending, and close the connection unless it was given."""
+        self._stopped.set()
+        self._new.set()
+        self._thread.join()
+        if self._own:
+            self.link.close()
+
+    def __enter__(self) -> ObstacleSender:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        """Stop sending."""
+        self.close()
+
+    def _run(self) -> None:
+        due = monotonic()
+        while not self._stopped.wait(max(due - monotonic(), 0)):
+            self._new.wait(PATIENCE * self._period_s)
+            self._new.clear()
+            if self._stopped.is_set():
+                return
+            self._send_or_tell()
+            due = max(due + self._period_s, monotonic() - self._period_s)
+
+    def _send_or_tell(self) -> None:
+        try:
+            why = self._send()
+        except Exception as error:  # whatever is wrong, nothing is sent, the user is told, and the next try may succeed
+            why = f"{type(error).__name__}: {error}" if not isinstance(error, StereovoxError) else str(error)
+        if bool(why) != bool(self._why):
+            self._tell(f"no obstacle distances are sent: {why}" if why else "obstacle distances are sent again")
+        self._why = why
+
+    def _send(self) -> str:
+        """Send what the map says now; return why not, nothing where it was sent."""
+        ages_s, T_world_body = self._mapper.health().ages_s, self._T_world_body
+        if T_world_body is None or not ages_s:
+            return ""  # nothing has come yet, which is no news
+        sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
+        if age_s > self._max_age_s:
+            return f"the last trusted frame{f' of {sensor}' if sensor else ''} is {age_s:.2f} s old"
+        seen_ns = max(self.link.now_ns() - round(1e9 * age_s), 0)
+        if not self.link.send(self._sectors(T_world_body, seen_ns)):
+            return f"{self.link.url} does not take them"
+        self.sent += 1
+        for message in self._places(T_world_body, seen_ns):
+            self.link.send(message)
+        return ""
+
+    def _sectors(self, T_world_body: Transform, seen_ns: int) -> Any:
+        m, rules = self.link.messages, self._rules
+        distances = obstacle_sectors(self._mapper.map, T_world_body, rules).centimetres(rules).tolist()
+        return m.MAVLink_obstacle_distance_message(
+            seen_ns // 1000, m.MAV_DISTANCE_SENSOR_UNKNOWN, distances, round(INCREMENT_DEG), 0, rules.max_cm,
+            INCREMENT_DEG, 0.0, m.MAV_FRAME_BODY_FRD,
+        )  # fmt: skip
+
+    def _places(self, T_world_body: Transform, seen_ns: int) -> list[Any]:
+        """Return the messages of all directions; made before the first is sent, since they must come close together."""
+        if self._directions is None:
+            return []
+        m, farthest = self.link.messages, self._directions.max_distance
+        return [
+            m.MAVLink_obstacle_distance_3d_message(
+                seen_ns // 1_000_000 % 2**32, m.MAV_DISTANCE_SENSOR_UNKNOWN, m.MAV_FRAME_BODY_FRD, 0xFFFF, *place, 0.0,
+                farthest,
+            )
+            for place in nearest_places(self._mapper.map, T_world_body, self._directions).tolist()
+        ]  # fmt: skip
+
+
+def _checked_mounts(mounts: Mapping[str, Transform]) -> dict[str, Transform]:
+    """Return the mounts as arrays; raises StereovoxError for one that is no rigid motion."""
+    for sensor, mount in mounts.items():
+        if not rigidity_error(mount) < 1e-3:
+            raise StereovoxError(f"mounts['{sensor}'] is no rigid motion (4, 4); give T_body_sensor")
+    return {sensor: np.array(mount, float) for sensor, mount in mounts.items()}

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bytes to and from an autopilot: `udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT`, `serial:DEVICE:BAUD`.
+
+pymavlink's own connections choose the protocol's version by an environment variable of the whole process; these do not.
+"""
+
+from __future__ import annotations
+
+import socket
+from contextlib import suppress
+from typing import Any, Protocol
+
+from stereovox.errors import MissingExtra, StereovoxError
+
+MAX_DATAGRAM = 65536
+CONNECT_S = 5.0
+FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+
+
+class Transport(Protocol):
+    """A way for bytes; one thread reads, another may write meanwhile."""
+
+    def read(self, seconds: float) -> bytes:
+        """Return what came within so many seconds; nothing if nothing did. Raises OSError where the way is gone."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; datagrams may be lost. Raises OSError where the way is gone."""
+        ...
+
+    def close(self) -> None:
+        """End it; a `read` in another thread returns soon."""
+        ...
+
+
+def open_transport(url: str) -> Transport:
+    """Return the way to an autopilot that a text names; raises StereovoxError for others and where there is none."""
+    kind, _, rest = url.partition(":")
+    place, _, number = rest.rpartition(":")
+    if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal():
+        raise StereovoxError(f"connection '{url}': give {FORMS}")
+    if kind == "serial":
+        return SerialTransport(url, place, int(number))
+    if not 0 <= int(number) <= 65535:
+        raise StereovoxError(f"connection '{url}': {number} is no port; give one up to 65535")
+    try:
+        return TcpTransport(place, int(number)) if kind == "tcp" else UdpTransport(kind, place, int(number))
+    except OSError as error:
+        raise StereovoxError(f"connection '{url}': {error}; is the address right, and the port not in use?") from None
+
+
+class UdpTransport:
+    """Datagrams. udpin: listens, and answers whoever was heard last; udpout: sends to one address."""
+
+    def __init__(self, kind: str, host: str, port: int):
+        address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._peer: Any = address if kind == "udpout" else None
+        try:
+            self._socket.bind(("", 0) if kind == "udpout" else address)
+        except OSError:
+            self._socket.close()
+            raise
+        self._follow = kind == "udpin"
+
+    @property
+    def port(self) -> int:
+        """The port of this end."""
+        return int(self._socket.getsockname()[1])
+
+    def read(self, seconds: float) -> bytes:
+        """Return the next datagram."""
+        self._socket.settimeout(seconds)
+        try:
+            data, sender = self._socket.recvfrom(MAX_DATAGRAM)
+        except (TimeoutError, ConnectionRefusedError):  # refused: nobody listens at the other end yet
+            return b""
+        if self._follow:
+            self._peer = sender
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram; without anybody to send it to, none."""
+        if self._peer is not None:
+            with suppress(ConnectionRefusedError, BlockingIOError, TimeoutError):
+                self._socket.sendto(data, self._peer)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class TcpTransport:
+    """A stream to a server."""
+
+    def __init__(self, host: str, port: int):
+        self._socket = socket.create_connection((host, port), CONNECT_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self, seconds: float) -> bytes:
+        """Return what came."""
+        self._socket.settimeout(seconds)
+        try:
+            data = self._socket.recv(MAX_DATAGRAM)
+        except TimeoutError:
+            return b""
+        if not data:
+            raise ConnectionResetError("the autopilot closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes."""
+        self._socket.sendall(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialTransport:
+    """A serial port, by pyserial."""
+
+    def __init__(self, url: str, device: str, baud: int):
+        try:
+            import serial
+        except ImportError:
+            raise MissingExtra("pyserial", "mavlink") from None
+        try:
+            self._port = serial.Serial(device, baud, timeout=0.1)
+        except (OSError, ValueError) as error:
+            raise StereovoxError(
+                f"connection '{url}': {error}; is the device right, and may this user use it?"
+            ) from None
+
+    def read(self, seconds: float) -> bytes:
+        """Return what came."""
+        self._port.timeout = seconds
+        return self._port.read(max(1, self._port.in_waiting))
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes."""
+        self._port.write(data)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()

@@ -70,6 +70,17 @@ def test_frames_are_written_as_they_come_also_when_the_run_is_stopped(mapper, tm
     assert column(found["/world/occupied"], "Boxes3D:centers")
 
 
+def test_clouds_are_written_as_points_in_the_world(mapper, tmp_path):
+    pytest.importorskip("rerun")
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    with rerun_of(mapper, str(tmp_path / "run.rrd")) as log:
+        log.after(sv.Cloud(np.array([[2.0, 0, 0], [0, 3.0, 0], [np.nan] * 3]), T), UpdateReport())
+    found = chunks(tmp_path / "run.rrd")
+    points = np.array(column(found["/world/cloud"], "Points3D:positions")[0])
+    assert np.allclose(points, [[3, 2, 3], [1, 5, 3]])
+
+
 def test_the_command_writes_one_beside_the_map(tmp_path):
     pytest.importorskip("rerun")
     words = ["--out", str(tmp_path / "room.svox"), "--frames", ":2", "--voxel-size", "0.3"]

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from stereovox.depth.cloud import checked_cloud
 from stereovox.frame import Reason
-from stereovox.viewer.frame import REASON_COLOURS, depth_picture
+from stereovox.viewer.frame import MAX_WIDTH_PX, REASON_COLOURS, cloud_picture, depth_picture, describe_frame
 from stereovox.viewer.live import LiveView
 from stereovox.viewer.replay import Replay
 from stereovox.viewer.viewer import open_viewer
@@ -46,6 +47,19 @@ def test_a_depth_picture_tells_why_a_pixel_has_no_value():
     assert far[2] > far[0]
     for colour, why in zip(others, reasons[2:], strict=True):
         assert "#" + bytes(colour.tolist()).hex() == REASON_COLOURS[why]
+
+
+def test_a_picture_of_a_cloud_shows_what_is_nearest_all_round():
+    points = np.array([[4.0, 0, 0], [2.0, 0, 0], [0, 3.0, 0], [0, 0, -1.0]])
+    cloud = checked_cloud(sv.Cloud(points, np.eye(4)), sv.load_config())
+    picture = cloud_picture(cloud, 4.0)
+    seen = picture.any(axis=2)
+    assert seen.sum() == 3
+    ahead, left = picture[0, MAX_WIDTH_PX // 2], picture[0, MAX_WIDTH_PX // 4]
+    assert ahead.any()
+    assert left.any()
+    assert (ahead != left).any()  # 2 m and 3 m
+    assert describe_frame(sv.Cloud(points, np.eye(4), name="a/b.bin"), None) == "b.bin"
 
 
 @pytest.mark.parametrize("window", [{}, {"window.size": [2.5, 2.5, 2.5]}])

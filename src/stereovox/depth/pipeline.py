@@ -10,7 +10,8 @@ from stereovox.depth.prepare import prepare
 from stereovox.depth.quality import check_depth, check_light
 from stereovox.depth.sphere.image import through_sphere
 from stereovox.depth.stereo.pipeline import StereoDepth
-from stereovox.frame import AnyFrame, DepthImage, Frame, StereoFrame
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, Cloud, DepthImage, Frame, StereoFrame, name_of
 from stereovox.trust.validate import validate_fields
 
 
@@ -23,10 +24,13 @@ class DepthPipeline:
     def matched(self, frame: AnyFrame) -> Frame:
         """Return a stereo frame with its depth, any other frame unchanged.
 
-        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for anything but a frame.
+        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for clouds and anything but a frame.
         """
         if isinstance(frame, Frame):
             return frame  # `prepare` validates its fields
+        if isinstance(frame, Cloud):
+            detail = "is a cloud, no image: it can be mapped with given poses, not tracked"
+            raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
         validate_fields(frame, StereoFrame, Frame)
         assert isinstance(frame, StereoFrame)
         check_light(frame, self._config.trust.max_unexposed_share)

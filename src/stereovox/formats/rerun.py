@@ -16,19 +16,22 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth import DepthPipeline
+from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.formats.points import cell_colours
-from stereovox.frame import AnyFrame, DepthImage
+from stereovox.frame import AnyFrame, CheckedCloud, Cloud, DepthImage
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.safe_io import replacing
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 
-CAMERA, CELLS, PATH = "world/camera", "world/occupied", "world/path"
+CAMERA, CELLS, PATH, CLOUD = "world/camera", "world/occupied", "world/path", "world/cloud"
 TIME = "stamp"
 MAX_BOXES = 300_000
 """Maps of more cells are written as points."""
+MAX_POINTS = 20_000
+"""Most points of a cloud; larger ones are thinned."""
 WIDEST_PX = 320
 """Most columns of a depth image; larger ones are thinned."""
 REWRITE_RATIO = 25
@@ -105,6 +108,14 @@ class RerunFile:
             self._stream.log(CAMERA, self._pinhole(image.camera, step))
         self._stream.log(f"{CAMERA}/depth", self._rerun.DepthImage(millimetres, meter=1000.0))
 
+    def add_cloud(self, cloud: CheckedCloud) -> None:
+        """Add the points of a cloud and where its sensor was."""
+        viewpoint = cloud.viewpoint
+        self.add_camera(None, viewpoint.T_world_camera, cloud.stamp_ns)
+        T = cloud.T_world_sensor
+        points = cloud.ends[cloud.hits][:: -(-len(cloud.ends) // MAX_POINTS)] @ T[:3, :3].T + T[:3, 3]
+        self._stream.log(CLOUD, self._rerun.Points3D(points.astype(np.float32)))
+
     def _at(self, stamp_ns: int | None) -> None:
         if stamp_ns is not None:
             self._stream.set_time(TIME, duration=np.timedelta64(stamp_ns, "ns"))
@@ -132,7 +143,10 @@ class RerunLog:
         """Log a frame that was offered to the map, between two frames."""
         start = monotonic()
         try:
-            self._file.add_depth(self._depth.image(self._depth.matched(frame)))
+            if isinstance(frame, Cloud):
+                self._file.add_cloud(checked_cloud(frame, voxel_map.config))
+            else:
+                self._file.add_depth(self._depth.image(self._depth.matched(frame)))
         except FrameRefused:
             return
         if start >= self._due:

@@ -10,8 +10,19 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.depth import DepthPipeline
+from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame, UpdateReport, name_of
+from stereovox.frame import (
+    AnyFrame,
+    CheckedCloud,
+    Cloud,
+    DepthImage,
+    Frame,
+    Reason,
+    StereoFrame,
+    UpdateReport,
+    name_of,
+)
 from stereovox.view.plain import colour_depth
 from stereovox.viewer.panel import plain
 
@@ -27,6 +38,8 @@ REASON_COLOURS = {
 }
 SHARED = "near red, far blue"
 MAX_WIDTH_PX = 480
+CLOUD_ROWS, HIGHEST_DEG, DEG_PER_ROW = 90, 45.0, 1.0
+"""Picture of a cloud: its rows, the elevation of the first, and from one to the next."""
 EMPTY = np.full((180, 240, 3), 128, np.uint8)
 
 
@@ -41,6 +54,20 @@ def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
     for why, colour in REASON_COLOURS.items():
         picture[reason == why] = tuple(bytes.fromhex(colour[1:]))
     return picture
+
+
+def cloud_picture(cloud: CheckedCloud, max_range: float) -> NDArray[np.uint8]:
+    """Return a cloud as RGB (rows, columns, 3), all round: the nearest range in each direction, ahead in the middle."""
+    points = cloud.ends[cloud.hits]
+    ranges = np.linalg.norm(points, axis=1)
+    left = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    up = np.degrees(np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)))
+    columns = np.clip((180 - left) / 360 * MAX_WIDTH_PX, 0, MAX_WIDTH_PX - 1).astype(int)
+    rows = np.clip((HIGHEST_DEG - up) / DEG_PER_ROW, 0, CLOUD_ROWS - 1).astype(int)
+    nearest = np.full((CLOUD_ROWS, MAX_WIDTH_PX), np.inf)
+    np.minimum.at(nearest, (rows, columns), ranges)
+    seen = slice(rows.min(), rows.max() + 1) if len(rows) else slice(CLOUD_ROWS)
+    return colour_depth(np.where(np.isfinite(nearest), nearest, np.nan)[seen], max_range)
 
 
 def reasons_key() -> str:
@@ -61,18 +88,23 @@ class FramePanel:
         self.text = server.gui.add_markdown("")
 
     def show(self, frame: AnyFrame, text: str) -> None:
-        """Show the depth image of a frame, which may be a refused one, with `text` below."""
+        """Show the depth image or the cloud of a frame, which may be a refused one, with `text` below."""
         try:
-            image = self._path.image(self._path.matched(frame))
-            self.image.image = depth_picture(image, self._config.max_range)
+            self.image.image = self._picture(frame)
         except FrameRefused:
             self.image.image = EMPTY
         self.text.content = text
 
+    def _picture(self, frame: AnyFrame) -> NDArray[np.uint8]:
+        far = self._config.max_range
+        if isinstance(frame, Cloud):
+            return cloud_picture(checked_cloud(frame, self._config), far)
+        return depth_picture(self._path.image(self._path.matched(frame)), far)
+
 
 def describe_frame(frame: AnyFrame, report: UpdateReport | None) -> str:
     """Return name and outcome of a frame, or of any object offered as one, as Markdown."""
-    called = name_of(frame) if isinstance(frame, Frame | StereoFrame) else type(frame).__name__
+    called = name_of(frame) if isinstance(frame, Frame | StereoFrame | Cloud) else type(frame).__name__
     name = plain(str(called).rpartition("/")[2])
     if report is None:
         return name

@@ -59,7 +59,7 @@ def test_a_picture_of_a_cloud_shows_what_is_nearest_all_round():
     assert ahead.any()
     assert left.any()
     assert (ahead != left).any()  # 2 m and 3 m
-    assert describe_frame(sv.Cloud(points, np.eye(4), name="a/b.bin"), None) == "b.bin"
+    assert describe_frame(sv.Cloud(points, np.eye(4), name="a/b"), None) == "b"
 
 
 @pytest.mark.parametrize("window", [{}, {"window.size": [2.5, 2.5, 2.5]}])

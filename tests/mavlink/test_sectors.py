@@ -118,6 +118,7 @@ def test_own_place_hides_unknown_cells_but_no_obstacles():
     around = ((-0.4, -0.4, -1), (0.4, 0.4, 1))
     rules = SectorRules(max_distance=3.0, own_radius=0.6, half_height=0.2)
     assert np.isinf(obstacle_sectors(hall(unknown=[around]), looking(0), rules).free_m).all()
+    assert np.isinf(obstacle_sectors(hall(tentative=[around]), looking(0), rules).free_m).all()
     touching = obstacle_sectors(hall(occupied=[around]), looking(0), rules)
     assert (touching.centimetres(rules) == 1).all()  # 0 would be passed over by PX4 and ArduPilot
 
@@ -145,7 +146,7 @@ def test_old_evidence_counts_as_unknown():
 
 
 def test_what_px4_reads_leaves_no_gap():
-    """PX4 up to 1.15 takes every second element for 10 degrees; a thin post anywhere must show in the right ones."""
+    """PX4 1.14 takes every second element for 10 degrees; a thin post anywhere must show in the right ones."""
     rules = SectorRules(max_distance=4.0)
     for bearing in np.arange(0.0, 360, 8.3):
         x, y = 3 * np.cos(np.radians(bearing)), -3 * np.sin(np.radians(bearing))

@@ -34,8 +34,8 @@ class DirectionRules:
 
     Attributes:
         max_distance: Metres up to which cells are looked at.
-        own_radius: Metres about the body within which unknown cells are taken for the vehicle's own place, as in
-            `SectorRules`.
+        own_radius: Metres about the body within which unknown and tentative cells are taken for the vehicle's own
+            place, as in `SectorRules`.
         oldest_s: As in `SectorRules`.
         unknown: Whether unknown cells are sent like obstacles. Without, unknown directions are free to ArduPilot.
 
@@ -83,9 +83,9 @@ def nearest_places(
     cells = _cells_within(origin, cell, rules.max_distance)
     centres: NDArray[np.float64] = (cells + 0.5) * cell
     states = states_of(voxel_map, centres, rules.oldest_s)
-    counts = (states == State.OCCUPIED) | (states == State.TENTATIVE)
-    if rules.unknown:
-        counts |= (states == State.UNKNOWN) & (np.linalg.norm(centres - origin, axis=1) > rules.own_radius)
+    beyond = np.linalg.norm(centres - origin, axis=1) > rules.own_radius
+    uncertain = (states == State.TENTATIVE) | ((states == State.UNKNOWN) & rules.unknown)
+    counts = (states == State.OCCUPIED) | (uncertain & beyond)
     nearest = np.clip(origin, cells[counts] * cell, (cells[counts] + 1) * cell) - origin
     places = _no_nearer(nearest, centres[counts] - origin) @ T_world_body[:3, :3] @ FRD_OF_OPTICAL.T
     return _nearest_in_each(places)

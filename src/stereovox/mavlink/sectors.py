@@ -6,7 +6,7 @@ The message (https://mavlink.io/en/messages/common.html#OBSTACLE_DISTANCE): whol
 `max_distance + 1` says that there is no obstacle, UINT16_MAX that nothing is known. What its readers make of it decides
 how it is filled here:
 
-- PX4 up to 1.15 has sectors of 10 degrees and takes element `ceil(angle / increment)` for each, every second one of 72
+- PX4 1.14 has sectors of 10 degrees and takes element `ceil(angle / increment)` for each, every second one of 72
   (CollisionPrevention.cpp, `_addObstacleSensorData`). Elements therefore overlap (`overlap_deg`).
 - PX4 does not look at elements up to `min_distance`, and ArduPilot neither at these nor at 0 (AP_Proximity_MAV.cpp,
   `handle_obstacle_distance_msg`): what is nearest would count as nothing. `min_distance` is therefore 0 and an obstacle
@@ -54,9 +54,9 @@ class SectorRules:
         max_distance: Horizontal metres up to which cells are looked at, at most 655.
         half_height: Metres above and below the body's origin within which cells count.
         overlap_deg: Degrees by which each sector reaches into its neighbours on either side, 0 to 45.
-        own_radius: Horizontal metres about the body within which unknown cells are taken for the vehicle's own place.
-            A camera does not see them before take-off; later none comes as near without being known, since the
-            vehicle stops before the unknown. What is known to be occupied there counts.
+        own_radius: Horizontal metres about the body within which unknown and tentative cells are taken for the
+            vehicle's own place. A camera does not see them before take-off; later none comes as near without being
+            known, since the vehicle stops before the unknown. What is occupied there counts.
         oldest_s: Free cells whose last evidence is older count as unknown (needs `map.keep_times`); infinite: none.
         unknown: What stands for unknown space before an obstacle: `obstacle`, the distance at which it begins;
             `unmeasured`, UINT16_MAX.
@@ -91,9 +91,9 @@ class Sectors(NamedTuple):
     """What a map says about sectors. Sector i is centred at 5 i degrees clockwise of the vehicle's front.
 
     Attributes:
-        obstacle_m: (72,) float64 horizontal metres from the body's origin to the nearest cell that is occupied or
-            tentative; infinite: none up to `max_distance`.
-        unknown_m: (72,) float64 the same for unknown cells.
+        obstacle_m: (72,) float64 horizontal metres from the body's origin to the nearest cell that is occupied, or
+            tentative beyond `own_radius`; infinite: none up to `max_distance`.
+        unknown_m: (72,) float64 the same for unknown cells beyond `own_radius`.
     """
 
     obstacle_m: NDArray[np.float64]

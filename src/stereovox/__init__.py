@@ -47,6 +47,10 @@ if TYPE_CHECKING:
     from stereovox.joining import Joined as Joined
     from stereovox.joining import join as join
     from stereovox.joining import merge as merge
+    from stereovox.live.rig import LiveCamera as LiveCamera
+    from stereovox.live.run import LiveResult as LiveResult
+    from stereovox.live.run import LiveRun as LiveRun
+    from stereovox.live.run import map_live as map_live
     from stereovox.mapper import AnyMapper as AnyMapper
     from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
@@ -83,6 +87,7 @@ if TYPE_CHECKING:
     from stereovox.sources.imu import ImuReadings as ImuReadings
     from stereovox.sources.imu import LiveImu as LiveImu
     from stereovox.sources.latest import Latest as Latest
+    from stereovox.sources.live_poses import LivePoses as LivePoses
     from stereovox.sources.poses import Poses as Poses
     from stereovox.track.tracker import Tracked as Tracked
     from stereovox.track.tracker import Tracker as Tracker
@@ -156,6 +161,10 @@ _HOMES = {
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",
+    "LiveCamera": "live.rig",
+    "LiveResult": "live.run",
+    "LiveRun": "live.run",
+    "map_live": "live.run",
     "FleetMap": "fleet",
     "FleetPlan": "fleet",
     "FleetScores": "fleet",
@@ -175,6 +184,7 @@ _HOMES = {
     "ImuReadings": "sources.imu",
     "LiveImu": "sources.imu",
     "Latest": "sources.latest",
+    "LivePoses": "sources.live_poses",
     "Tracked": "track.tracker",
     "Tracker": "track.tracker",
     "CameraTrack": "track_run",

@@ -24,6 +24,7 @@ from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.foreign_files import cure_of
 from stereovox.sources.latest import LatestStream
+from stereovox.sources.paced import Paced
 from stereovox.sources.pair_file import PairSettings
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.robots.robot import Robot
@@ -128,6 +129,30 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
         parse_slice(frames)
     camera = LatestStream(live(where))
     return camera if frames is None else Excerpt(camera, frames)
+
+
+def open_camera(path_or_name: str | os.PathLike[str]) -> Stream:
+    """Start a live camera (`realsense:`), or play a recording or simulation at its own pace as if it were one.
+
+    Args:
+        path_or_name: As for `open_stream`.
+
+    Returns:
+        Its frames as they come, which nothing drops here; those of a recording are stamped by this machine's clock.
+
+    Raises:
+        SourceError: As for `open_source`.
+    """
+    where = os.fspath(path_or_name)
+    live = _live_class(where)
+    if live is not None:
+        return live(where)
+    try:
+        return Paced(open_source(where))
+    except NoPoses:
+        images = Paced(open_images(where))
+        images.posed = False
+        return images
 
 
 def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:

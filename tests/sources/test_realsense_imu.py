@@ -143,7 +143,7 @@ def plugged(monkeypatch):
             format=SimpleNamespace(z16="z16"), camera_info=SimpleNamespace(serial_number="serial"),
             option=SimpleNamespace(**{name: name for name in names}), frame_queue=queue, context=lambda: camera,
         )  # fmt: skip
-        monkeypatch.setattr(realsense, "_library", lambda: rs)
+        monkeypatch.setattr(realsense, "library", lambda: rs)
         return camera
 
     return plug

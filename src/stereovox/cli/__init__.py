@@ -24,6 +24,7 @@ from stereovox.errors import StereovoxError, did_you_mean, one_line, printed
 COMMANDS = (
     "demo",
     "map",
+    "live",
     "fleet",
     "info",
     "picture",

@@ -80,7 +80,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         from stereovox.ros.mapping import Mapping
         from stereovox.ros.options import freeze
         from stereovox.ros.services import check_continuable
-        from stereovox.ros.warm_up import warm_up
+        from stereovox.warm_up import warm_up
 
         config, options = _settings(arguments, node)
         options.check_sources(config.dimensions)

@@ -27,7 +27,7 @@ from stereovox.ros.poses import PoseBuffer, fixed_transform
 from stereovox.ros.services import Services
 from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses, Tracking
-from stereovox.ros.waiting import Arrival, Waiting
+from stereovox.sources.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when idle, and while frames are waiting."""

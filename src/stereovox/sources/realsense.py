@@ -71,7 +71,7 @@ class RealSense(Stream):
     layout = "a connected RealSense camera (realsense: or realsense:SERIAL)"
 
     def __init__(self, location: str, context: Any = None):
-        self._rs = _library()
+        self._rs = library()
         serial, self.options = _parse(location)
         location = location.removesuffix(":")  # what messages begin with
         try:
@@ -162,7 +162,8 @@ class RealSense(Stream):
         )  # fmt: skip
 
 
-def _library() -> Any:
+def library() -> Any:
+    """Return pyrealsense2; raises MissingExtra without it."""
     try:
         import pyrealsense2
     except ImportError:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def vehicle_grid(
         raise StereovoxError(f"not one frame could be used ({next(iter(why.values()), 'the source is empty')})")
     for name, text in why.items():
         tell(f"{name or 'the camera'}: its last frame cannot be used ({text})")
-    grid, now_ns = _together(last)
+    grid, now_ns = together(last)
     return grid, now_ns, refused
 
 
@@ -87,7 +87,11 @@ def _grid_of(
     return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body
 
 
-def _together(last: dict[str, tuple[SphereGrid, Transform]]) -> tuple[SphereGrid, int]:
+def together(last: Mapping[str, tuple[SphereGrid, Transform]]) -> tuple[SphereGrid, int]:
+    """Return the grid of all cameras' last ones, seen from where the body was at the newest, and its time in ns.
+
+    last: by camera, at least one: its grid, and T_world_body (4, 4) when it was taken.
+    """
     newest, T_world_now = max(last.values(), key=lambda item: _stamp(item[0]))
     grids = [_carried(grid, inverse(T_world_now) @ T_world_then) for grid, T_world_then in last.values()]
     return stitch(grids or [empty(newest.layout)]), _stamp(newest)

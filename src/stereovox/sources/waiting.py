@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queues of messages that wait for their pose or for a busy map."""
+"""Queues of messages and images that wait for their pose or for a busy map."""
 
 from __future__ import annotations
 
@@ -56,9 +56,12 @@ class Waiting(Generic[T]):
         is_ready: returns whether everything that a frame needs is there.
         """
         now = self._clock()
-        due = [queue for queue in self._queues.values() if queue and self._due(queue[0], is_ready, now)]
+        for queue in self._queues.values():
+            for one in queue:  # also behind the first: how long a frame has been ready counts while others are mapped
+                self._note(one, is_ready, now)
+        due = [queue for queue in self._queues.values() if queue and self._due(queue[0], now)]
         for queue in due:
-            while len(queue) > 1 and self._late(queue[0], now) and self._due(queue[1], is_ready, now):
+            while len(queue) > 1 and self._late(queue[0], now) and self._due(queue[1], now):
                 self._drop(queue)
         return min(due, key=lambda queue: queue[0].stamp_ns).popleft() if due else None
 
@@ -66,9 +69,11 @@ class Waiting(Generic[T]):
         """Remove all frames without counting them as dropped."""
         self._queues.clear()
 
-    def _due(self, one: Arrival[T], is_ready: Callable[[Arrival[T]], bool], now: int) -> bool:
+    def _note(self, one: Arrival[T], is_ready: Callable[[Arrival[T]], bool], now: int) -> None:
         if one.ready_ns is None and is_ready(one):
             one.ready_ns = now
+
+    def _due(self, one: Arrival[T], now: int) -> bool:
         return one.ready_ns is not None or now - one.arrived_ns > self._wait_ns
 
     def _late(self, one: Arrival[T], now: int) -> bool:

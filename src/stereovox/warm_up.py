@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
+from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
-from stereovox.ros.mapping import Mapping
+from stereovox.mapper import GridMapper, Mapper
+from stereovox.products.live_projection import LiveProjection
 from stereovox.sources.tracker import AXES
 from stereovox.track.tracker import Tracker
 
@@ -20,7 +23,7 @@ def warm_up(config: Config, tracked: bool = False) -> None:
 
     tracked: those that tracking needs, too.
     """
-    mapping = Mapping(load_config(config, **{"window.outside": "drop"}))
+    small = load_config(config, **{"window.outside": "drop"})
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = AXES["ros"].T
@@ -31,10 +34,18 @@ def warm_up(config: Config, tracked: bool = False) -> None:
         Frame(depth, camera, T_world_camera, stamp_ns, scale)
         for stamp_ns, (depth, scale) in enumerate(zip(depths, (1.0, 0.001), strict=True))
     ]
-    for frame in frames:
-        mapping.add(frame)
-    mapping.grid()
-    mapping.close()
+    if config.dimensions == 2:
+        floor = GridMapper(small)
+        for frame in frames:
+            floor.add(frame)
+        floor.occupancy()
+    else:
+        mapper = Mapper(small)
+        for frame in frames:
+            mapper.add(frame)
+        with suppress(StereovoxError):  # a map that is not level has no 2-D map
+            LiveProjection(mapper.map).grid()
+        mapper.close()
     if tracked:
         tracker = Tracker(config)
         for stamp_ns, frame in enumerate([*frames, *frames]):

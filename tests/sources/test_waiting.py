@@ -3,7 +3,7 @@
 
 import pytest
 
-from stereovox.ros.waiting import Arrival, Waiting
+from stereovox.sources.waiting import Arrival, Waiting
 
 MS = 1_000_000
 
@@ -112,3 +112,16 @@ def test_the_queue_is_bounded(clock):
     assert len(waiting) == 3
     assert taken(waiting, always) == ["5", "6", "7"]
     assert waiting.dropped == {"s": 5}
+
+
+def test_a_frame_is_late_by_when_it_was_ready_not_by_when_its_turn_came(clock):
+    """A map that stays too slow must not fall behind by as many frames as fit into the queue."""
+    waiting = queue(clock, late=50)
+    for k in range(8):
+        waiting.put("a", k, "", str(k))
+    waiting.pop(always)
+    clock.now = 60 * MS
+    found = waiting.pop(always)
+    assert found is not None
+    assert found.content == "7"
+    assert waiting.dropped["a"] == 6

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is made of a map while it grows: a 2-D map in files, and the distances all round the body.
+
+Each is an observer of the run: `after` for each frame, `finish` once the last one is in the map, `close` at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from time import monotonic
+from typing import Any, Protocol
+
+from stereovox.config import Config, load_config
+from stereovox.depth import DepthPipeline, prepare
+from stereovox.depth.sphere import SphereGrid, SphereLayout, accumulate
+from stereovox.depth.sphere.vehicle import together
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.formats.map_server import write_map_server
+from stereovox.frame import Cloud, UpdateReport
+from stereovox.mapper import Mapper
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products.floor_axes import Heights
+from stereovox.products.live_projection import LiveProjection
+from stereovox.safe_io import FLOOR_ENDINGS, check_file
+from stereovox.se3 import Transform, inverse
+
+GRID_S = 1.0
+"""Seconds between two writes of the 2-D map."""
+STEP_DEG = 2.0
+"""Width of a cell of the spherical grid where the settings do not choose one."""
+
+
+class Output(Protocol):
+    """An observer that has something to finish, and something to close."""
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        """Process a frame that was offered to the map."""
+        ...
+
+    def finish(self) -> None:
+        """Show or write what there is after the last frame."""
+        ...
+
+    def close(self) -> None:
+        """End; whether the run ended well or not."""
+        ...
+
+
+class GridFile:
+    """Keeps the 2-D map of a growing map in map_server files, written anew in a thread of its own.
+
+    Args:
+        mapper: The mapper whose map is projected.
+        file: `.yaml`, `.pgm` or `.png`.
+        heights: As for `project`.
+        period_s: Seconds between two writes.
+        notify: Called with a line where the files could not be written.
+
+    Raises:
+        StereovoxError: The file cannot be written, or the map is not level.
+    """
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        file: str | Path,
+        heights: Heights | None = None,
+        period_s: float = GRID_S,
+        notify: Callable[[str], None] = lambda line: None,
+    ):
+        self._file = check_file(file, FLOOR_ENDINGS)
+        self._projection, self._period_s, self._notify = LiveProjection(mapper.map, heights), period_s, notify
+        self._worker = ThreadPoolExecutor(1, "stereovox-grid")
+        self._busy: Future[None] | None = None
+        self._due, self._new = 0.0, False
+        self.written = 0
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        """Write the 2-D map if that is due and the last write is done."""
+        self._new |= not report.refused
+        now = monotonic()
+        if self._new and now >= self._due and (self._busy is None or self._busy.done()):
+            self._due = now + self._period_s
+            self._write()
+
+    def finish(self) -> None:
+        """Write the complete 2-D map."""
+        self._write()
+        if self._busy is not None:
+            self._busy.result()
+
+    def close(self) -> None:
+        """Wait for the last write."""
+        self._worker.shutdown()
+
+    def _write(self) -> None:
+        self._new = False
+        try:
+            grid = self._projection.grid()
+        except StereovoxError as error:
+            self._notify(f"{self._file}: {error}")
+            return
+        if grid is not None:
+            self._busy = self._worker.submit(self._save, grid)
+
+    def _save(self, grid: OccupancyGrid) -> None:
+        try:
+            write_map_server(grid, self._file)
+            self.written += 1
+        except StereovoxError as error:
+            self._notify(str(error))
+
+
+class LiveSphere:
+    """The distances to the nearest surfaces in all directions from the body, by the last image of each camera.
+
+    Args:
+        config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees where they say nothing.
+        mounts: T_body_camera (4, 4) by the name of the sensor; body x forward, y left, z up.
+        picture: PNG to draw at the end; None: none.
+
+    Raises:
+        StereovoxError: The picture cannot be written.
+    """
+
+    def __init__(self, config: Config, mounts: Mapping[str, Transform], picture: str | Path | None = None):
+        self._picture = None if picture is None else check_file(picture, (".png",))
+        self._config = load_config(config, **{"sphere.step_deg": config.sphere.step_deg or STEP_DEG})
+        self._layout = SphereLayout.configured(self._config.sphere)
+        self._mounts, self._pipeline = mounts, DepthPipeline(self._config)
+        self._last: dict[str, tuple[SphereGrid, Transform]] = {}
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        """Take in what a camera sees, unless the map refused it; clouds of lidars are left out."""
+        if report.refused or isinstance(frame, Cloud):
+            return
+        try:
+            image = prepare(self._pipeline.matched(frame), self._config)
+        except FrameRefused:
+            return  # the map took it at another quality
+        mount = self._mounts[frame.sensor]
+        T_world_body = image.T_world_sensor @ inverse(mount)
+        self._last[frame.sensor] = accumulate(image, mount, self._config, self._layout), T_world_body
+
+    @property
+    def known(self) -> bool:
+        """Whether any camera has seen anything."""
+        return bool(self._last)
+
+    def grid(self) -> tuple[SphereGrid, int]:
+        """Return the grid of all cameras from where the body is by the newest image, and its time in nanoseconds.
+
+        Each cell has its own stamp: what another camera saw before is older.
+
+        Raises:
+            StereovoxError: Nothing has been seen so far.
+        """
+        if not self._last:
+            raise StereovoxError("no image has been mapped yet; ask again later")
+        return together(self._last)
+
+    def finish(self) -> None:
+        """Draw the picture."""
+        if self._picture is not None and self._last:
+            from stereovox.view.sphere import sphere_picture
+
+            grid, now_ns = self.grid()
+            sphere_picture(grid, self._picture, now_ns=now_ns)
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to close."""

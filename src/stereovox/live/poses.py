@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where poses of a live run come from, by name."""
+
+from __future__ import annotations
+
+from stereovox import registry
+from stereovox.errors import SourceError
+from stereovox.pose_choice import GIVEN, TRACK
+from stereovox.sources.pose_stream import PoseStream
+
+POSES = {
+    "udp": "stereovox.sources.pose_stream:UdpPoses",
+    "tcp": "stereovox.sources.pose_stream:TcpPoses",
+    "t265": "stereovox.sources.pose_stream:T265",
+}
+"""Streams of poses (`PoseStream`), asked in this order, then entry points in the group `stereovox.poses`."""
+
+
+def open_poses(where: str) -> PoseStream:
+    """Return the stream of poses that `where` names; it is not started.
+
+    Raises:
+        SourceError: It names none, or one that cannot be used.
+    """
+    for name in registry.names("poses", POSES):
+        kind = registry.find("poses", POSES, name)
+        if kind.recognises(where):
+            return kind(where)
+    words = f"{TRACK}, {GIVEN}, t265, udp://:5005 or tcp://HOST:5005"
+    raise SourceError(f"poses '{where}' is unknown; give {words}")

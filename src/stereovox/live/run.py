@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map cameras that are connected now: the Python side of `stereovox live`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter, process_time
+from types import TracebackType
+from typing import Any
+
+from stereovox.config import Config
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.summary import summarise
+from stereovox.frame import UpdateReport
+from stereovox.live.latency import Latency
+from stereovox.live.outputs import GridFile, LiveSphere, Output
+from stereovox.live.poses import open_poses
+from stereovox.live.recorder import Recorder
+from stereovox.live.rig import LiveCamera, read_live
+from stereovox.live.stream import WAIT_S, LiveStream
+from stereovox.mapper import Mapper
+from stereovox.maps import VoxelMap
+from stereovox.pose_choice import GIVEN, TRACK
+from stereovox.products.floor_axes import Heights
+from stereovox.run import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
+from stereovox.sources.base import Stream
+from stereovox.sources.live_poses import LivePoses
+from stereovox.sources.pose_stream import PoseStream
+from stereovox.warm_up import warm_up
+
+Cameras = str | Path | Stream | LiveCamera | Sequence[LiveCamera]
+PosesFrom = str | PoseStream | LivePoses | None
+
+
+@dataclass(frozen=True)
+class LiveResult:
+    """What became of a live run.
+
+    Attributes:
+        map: The map, as saved.
+        out: Where it was saved.
+        reports: One report for each image that was offered to the map, in order.
+        stopped: Whether a signal ended it (Ctrl-C, SIGTERM or SIGHUP), as is usual.
+        live: Latency, images and poses by where they came from, and outputs: the part `live` of `summary`.
+        poses: `given`, `track`, or the name of the stream of poses.
+    """
+
+    map: VoxelMap
+    out: Path
+    reports: list[UpdateReport]
+    stopped: bool
+    live: dict[str, Any]
+    poses: str
+
+    def summary(self) -> dict[str, Any]:
+        """Summarise the run.
+
+        Returns:
+            The numbers of `stereovox live --json`: those of `map`, and `live`.
+        """
+        return {**summarise(self.map, self.reports), "poses": self.poses, "live": self.live}
+
+
+def map_live(
+    cameras: Cameras,
+    out: str | Path,
+    *,
+    poses: PosesFrom = None,
+    profile: str | Path | Config | None = None,
+    resume: bool = False,
+    wait_s: float = WAIT_S,
+    seconds: float | None = None,
+    grid: str | Path | None = None,
+    heights: Heights | None = None,
+    sphere: str | Path | None = None,
+    record: str | Path | None = None,
+    view: int | None = None,
+    checkpoint_s: float = CHECKPOINT_S,
+    observers: Sequence[Observer] = (),
+    notify: Callable[[str], None] = lambda line: None,
+    **overrides: Any,
+) -> LiveResult:
+    """Map one or several cameras while they run, until a signal (Ctrl-C, SIGTERM), `seconds`, or they end.
+
+    Each image waits for its pose; one whose pose does not come is refused with the reason, and no pose is guessed. The
+    map is saved at regular checkpoints and at the end, as by `map_recording`.
+
+    Args:
+        cameras: Name of a camera (`realsense:`) or recording, a `live.toml`, a `Stream`, or one or several
+            `LiveCamera`.
+        out: Folder of the map to write.
+        poses: `track`: the first camera is tracked by its own images; `given`: those that images come with; a name of a
+            stream (`t265`, `udp://:5005`, `tcp://HOST:5005`), a `PoseStream`, or a `LivePoses` that you fill. None:
+            as the `live.toml` says, else given where all images have poses, else track.
+        profile: Profile name, TOML file or Config; None: `default`, or with `resume` the map's own settings.
+        resume: Continue the map at `out`; the poses must be in its world.
+        wait_s: Seconds that an image waits for its pose.
+        seconds: How long to map.
+        grid: 2-D map to keep up to date (`.yaml`).
+        heights: Lowest and highest metres in which obstacles mark it.
+        sphere: Picture of the distances all round to draw at the end (`.png`).
+        record: Recording to write beside (`.mcap`, `.bag` or `.db3`).
+        view: Port of a page that shows the map while it grows; 0: any free port. None: no page.
+        checkpoint_s: Seconds between two saves; 0: save only at the end.
+        observers: Called after each image, before the other outputs.
+        notify: Called with each line that a user should see.
+        **overrides: Settings by name, as for `Mapper`.
+
+    Returns:
+        The map, the report of each image, and how long they took.
+
+    Raises:
+        StereovoxError: One line: invalid cameras, poses, settings or outputs, all cameras failed, or not one image
+            could be used. What was mapped until then is saved.
+    """
+    given: dict[str, Any] = {"poses": poses, "profile": profile, "resume": resume, "wait_s": wait_s}
+    given |= {"seconds": seconds, "checkpoint_s": checkpoint_s, "notify": notify}
+    with LiveRun(cameras, out, **given, **overrides) as run:
+        run.add_outputs(grid=grid, heights=heights, sphere=sphere, record=record, view=view)
+        return run.finish(observers)
+
+
+class LiveRun:
+    """`map_live` in two steps: `with LiveRun(...) as run` opens and checks everything, `run.finish()` maps.
+
+    Args:
+        cameras: As for `map_live`, like all other arguments.
+
+    Attributes:
+        mapper: The mapper, once entered.
+        stream: The images with their poses.
+        sphere: The distances all round, if that output was added.
+        page: Link to the page, if that output was added; else "".
+        outputs: The outputs that were added.
+
+    Raises:
+        StereovoxError: As `map_live`, on entering.
+    """
+
+    mapper: Mapper
+    stream: LiveStream
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        out: str | Path,
+        *,
+        poses: PosesFrom = None,
+        profile: str | Path | Config | None = None,
+        resume: bool = False,
+        wait_s: float = WAIT_S,
+        seconds: float | None = None,
+        checkpoint_s: float = CHECKPOINT_S,
+        notify: Callable[[str], None] = lambda line: None,
+        **overrides: Any,
+    ):
+        self.out = Path(out)
+        self._cameras, self._poses = _cameras(cameras, poses)
+        self._live = {"wait_s": wait_s, "seconds": seconds, "notify": notify}
+        self._map = {"profile": profile, "resume": resume, "checkpoint_s": checkpoint_s, **overrides}
+        self._notify, self._resume = notify, resume
+        self._open = ExitStack()
+        self.outputs: list[Output] = []
+        self._recorder: Recorder | None = None
+        self.sphere: LiveSphere | None = None
+        self._page: list[Output] = []
+        self.page = ""
+
+    def __enter__(self) -> LiveRun:
+        poses = self._poses
+        words = (None, GIVEN, TRACK)
+        opened = open_poses(poses) if isinstance(poses, str) and poses not in words else poses
+        self.stream = LiveStream(self._cameras, opened, **self._live)
+        if self._resume and self.stream.tracked:
+            raise StereovoxError(f"{self.out}: a tracked camera does not know where in it it is; begin a new map")
+        with ExitStack() as stack:
+            self._run = stack.enter_context(
+                MapRun(self.stream, self.out, poses=GIVEN, notify=self._notify, **self._map)
+            )
+            self.mapper = self._run.mapper
+            self.stream.config = self.mapper.config
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._open.close()
+
+    def add_outputs(
+        self,
+        *,
+        grid: str | Path | None = None,
+        heights: Heights | None = None,
+        sphere: str | Path | bool | None = None,
+        record: str | Path | None = None,
+        view: int | None = None,
+    ) -> None:
+        """Add outputs, as the arguments of `map_live` of the same names.
+
+        Args:
+            grid: As there, like the others.
+            sphere: True: keep the distances without drawing a picture.
+
+        Raises:
+            StereovoxError: One of them cannot be written, the page cannot be served, or the map is not level.
+        """
+        if sphere:
+            picture = None if sphere is True else sphere
+            self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture)
+            self._add(self.sphere)
+        if grid is not None:
+            self._add(GridFile(self.mapper, grid, heights, notify=self._notify))
+        if record is not None:
+            self._recorder = Recorder(record, self.stream.mounts, self.stream.imus(), self._notify)
+            self._add(self._recorder)
+        if view is not None:
+            from stereovox.viewer.live import LiveView
+
+            page = LiveView(self.mapper, self.out.stem, port=view)
+            self._open.callback(page.close)
+            self._page.append(page)
+            self.page = page.url
+
+    def finish(self, observers: Sequence[Observer] = ()) -> LiveResult:
+        """Map until a signal, the time or the cameras end it, and save the map.
+
+        Args:
+            observers: Called after each image, before the outputs. Those that have them are called `finish` and `close`
+                at the end, as the outputs are.
+
+        Returns:
+            The map and the report of each image.
+
+        Raises:
+            StereovoxError: All cameras failed, the disk is full, or not one image could be used.
+        """
+        warm_up(self.mapper.config, self.stream.tracked)
+        reports, latency = _Reports(), Latency(lambda: self.stream.moment)
+        begin, cpu = perf_counter(), process_time()
+        stopped, outputs = False, [*observers, *self.outputs]
+        chain = [reports, latency.mapped, *outputs, latency.sent, *self._page]
+        with interrupt_between_steps() as check:  # a second signal, as `timeout` sends it, does not cut the saving
+            self.stream.check = check
+            try:
+                self._run.finish(chain)
+            except KeyboardInterrupt:
+                stopped = True
+            finally:
+                seconds, cpu = perf_counter() - begin, process_time() - cpu
+                for output in (*outputs, *self._page):
+                    getattr(output, "finish", _nothing)()
+                for output in outputs:
+                    getattr(output, "close", _nothing)()
+        if not self.mapper.map.frames:
+            raise StereovoxError(f"{self.stream.name}: stopped before an image could be mapped, no map is written")
+        live = {
+            "seconds": round(seconds, 3),
+            "cpu_share": round(cpu / seconds, 4),
+            "latency_ms": latency.summary(),
+            "dropped": self.stream.dropped,
+            **self.stream.counts(),
+        }
+        if self._recorder is not None:
+            live["recorded"] = dict(self._recorder.counts)
+        return LiveResult(self.mapper.map, self.out, reports.reports, stopped, live, self._poses_word())
+
+    def _add(self, output: Output) -> None:
+        self.outputs.append(output)
+        self._open.callback(output.close)
+
+    def _poses_word(self) -> str:
+        if self.stream.tracked:
+            return TRACK
+        return GIVEN if self.stream.poses is None else self.stream.poses.where
+
+
+class _Reports:
+    """An observer that keeps all reports."""
+
+    def __init__(self) -> None:
+        self.reports: list[UpdateReport] = []
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        self.reports.append(report)
+
+
+def _cameras(cameras: Cameras, poses: PosesFrom) -> tuple[Sequence[LiveCamera], PosesFrom]:
+    """Return the cameras, and where poses come from: as was asked for, else as a `live.toml` says."""
+    if isinstance(cameras, LiveCamera):
+        return [cameras], poses
+    if isinstance(cameras, str | Path):
+        if Path(cameras).suffix != ".toml":
+            return [LiveCamera(cameras)], poses
+        setup = read_live(cameras)
+        return setup.cameras, poses or setup.poses or None
+    if isinstance(cameras, Sequence):
+        return cameras, poses
+    return [LiveCamera(cameras)], poses
+
+
+def _nothing() -> None:
+    """Stand in for what an observer does not have."""

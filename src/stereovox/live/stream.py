@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frames of several live cameras in one stream, each with its pose, its sensor's name and the clock of the poses.
+
+A thread for each camera puts its images into queues; an image leaves them once its pose is there, or will not come.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Condition, Event, Thread
+from time import monotonic, monotonic_ns
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stereovox.config import Config, load_config
+from stereovox.errors import FrameRefused, SourceError, StereovoxError
+from stereovox.frame import AnyFrame, Frame, name_of
+from stereovox.live.rig import LiveCamera, check_cameras
+from stereovox.opening import open_camera
+from stereovox.pose_choice import GIVEN, HOW, TRACK
+from stereovox.se3 import inverse
+from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.imu import Imu
+from stereovox.sources.latest import STOPPING_S, Latest
+from stereovox.sources.live_poses import LivePoses
+from stereovox.sources.pose_stream import PoseStream
+from stereovox.sources.waiting import Arrival, Waiting
+from stereovox.sources.wall_clock import epoch_ns
+from stereovox.survey import level_pose
+from stereovox.track.stream import POSE_FAULTS, follow
+from stereovox.track.tracker import Tracked, Tracker
+
+WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 8
+"""Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer
+ones; images that wait, for each camera, and for tracking."""
+TICK_S, SOON_S = 0.1, 0.01
+"""Seconds after which a stream without news says so, and after which waiting images are looked at again."""
+REMIND_S = 5.0
+"""Seconds without any pose, or with bad lines, until the user is told."""
+HOST_CLOCK_NS = 5_000_000_000
+"""Stamps that are not older than this by the clock of this machine are believed to be by it."""
+REMEMBERED = 300
+"""Arrivals that are remembered for each camera."""
+
+
+class Moment(NamedTuple):
+    """When an image was taken, by its stamp (None: by another clock than this machine's), and when it arrived.
+
+    taken_ns: since the epoch. arrived_ns: monotonic.
+    """
+
+    camera: str
+    taken_ns: int | None
+    arrived_ns: int
+
+
+@dataclass(eq=False)
+class _Feed:
+    """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more."""
+
+    camera: LiveCamera
+    stream: Stream
+    offset_ns: int
+    tracked: bool = False
+    received: int = 0
+    before_first_pose: int = 0
+    ended: bool = False
+    failure: str = ""
+    host_clock: bool | None = None
+    latest: Latest[AnyFrame] | None = None
+
+    def __post_init__(self) -> None:
+        self.moments: OrderedDict[int, Moment] = OrderedDict()
+
+    @property
+    def name(self) -> str:
+        return self.camera.title
+
+
+class LiveStream(Stream):
+    """Images of several cameras with their poses, in order of time as far as they have arrived.
+
+    Iterating starts cameras and poses, and stops them. Cameras that are recordings end; the stream ends with the last
+    one. A camera that fails does not end the others.
+
+    Args:
+        cameras: The cameras.
+        poses: `given`: those of the images; `track`: the first camera is tracked by its own images, and the others
+            move with it; or a stream of poses of the body, or a buffer that you fill. None: given where all images
+            have poses, else track.
+        wait_s: Seconds that an image waits for its pose.
+        seconds: How long to go on; None: until the cameras end.
+        notify: Called with each line that a user should see.
+
+    Attributes:
+        poses: The poses of the body; None with `given`.
+        config: Settings, for tracking.
+        check: Called again and again, also while no image comes; an exception of it ends the iteration.
+        on_start: Called once cameras and poses have been started.
+        moment: When the image that was yielded last was taken and arrived.
+        mounts: T_body_camera (4, 4) by the name of the camera, which is the `sensor` of its images.
+        tracked: Whether the first camera is tracked.
+        imu_use: What tracking made of an IMU, in words.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[LiveCamera],
+        poses: str | PoseStream | LivePoses | None = None,
+        *,
+        wait_s: float = WAIT_S,
+        seconds: float | None = None,
+        notify: Callable[[str], None] = lambda line: None,
+    ):
+        if not 0 <= wait_s <= 60 or (seconds is not None and not seconds > 0):
+            raise StereovoxError(f"wait_s {wait_s:g}, seconds {seconds}: give at most 60 s, and more than none")
+        self.config = load_config("default")
+        self.check: Callable[[], object] = lambda: None
+        self.on_start: Callable[[], object] = lambda: None
+        self._notify, self._seconds = notify, seconds
+        self._feeds = [_feed(camera) for camera in check_cameras(cameras)]
+        if poses is None:
+            poses = GIVEN if all(getattr(feed.stream, "posed", True) for feed in self._feeds) else TRACK
+        self.tracked = poses == TRACK
+        self._stream = poses if isinstance(poses, PoseStream) else None
+        self.poses: LivePoses | None = None
+        if poses == TRACK:
+            self.poses, self._feeds[0].tracked = LivePoses(f"{self._feeds[0].name}, tracked"), True
+        elif isinstance(poses, PoseStream | LivePoses):
+            self.poses = poses.poses if isinstance(poses, PoseStream) else poses
+        elif poses != GIVEN:
+            raise StereovoxError(f"poses '{poses}' is no stream of poses; open it, or give {TRACK} or {GIVEN}")
+        self.name, self.camera = ", ".join(feed.name for feed in self._feeds), self._feeds[0].stream.camera
+        self.name += f", {HOW[TRACK]}" if self.tracked else ""
+        self.notes = tuple(note for feed in self._feeds for note in getattr(feed.stream, "notes", ()))
+        self.moment = Moment("", None, 0)
+        self.mounts = {feed.name: feed.camera.T_body_camera for feed in self._feeds}
+        self._waiting: Waiting[tuple[_Feed, AnyFrame]] = Waiting(
+            QUEUE, round(1e9 * wait_s), round(1e9 * LATE_S), monotonic_ns
+        )
+        self._change, self._stopped = Condition(), Event()
+        self._remind = 0.0
+        self._told = 0
+        self.imu_use = ""
+        if self.poses is not None:
+            self.poses.listen(self._wake)
+
+    @property
+    def dropped(self) -> int:
+        """Images that were not consumed in time."""
+        tracked = sum(feed.latest.dropped for feed in self._feeds if feed.latest is not None)
+        return self._waiting.dropped.total() + tracked
+
+    def imus(self) -> dict[str, Imu]:
+        """Return the IMUs of the cameras that have one, by the name of the camera."""
+        found = {feed.name: imu_of(feed.stream) for feed in self._feeds}
+        return {name: imu for name, imu in found.items() if imu is not None}
+
+    def counts(self) -> dict[str, Any]:
+        """Return what became of images and poses: by camera `received`, `dropped`, `before_first_pose`; of poses."""
+        cameras = {
+            feed.name: {
+                "received": feed.received,
+                "dropped": self._waiting.dropped[feed.name] + (feed.latest.dropped if feed.latest else 0),
+                "before_first_pose": feed.before_first_pose,
+                **({"failure": feed.failure} if feed.failure else {}),
+            }
+            for feed in self._feeds
+        }
+        if self.poses is None:
+            return {"cameras": cameras}
+        more = dict(self._stream.counts) if self._stream is not None else {}
+        return {"cameras": cameras, "poses": {"added": self.poses.added, **dict(self.poses.counts), **more}}
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        end = monotonic() + (self._seconds or float("inf"))
+        self._remind = monotonic() + REMIND_S
+        with ExitStack() as stack:
+            stack.callback(self._stopped.set)
+            if self._stream is not None:
+                self._stream.start()
+                stack.callback(self._stream.stop)
+            for feed in self._feeds:
+                thread = Thread(target=self._run, args=(feed,), name=f"stereovox-{feed.name}", daemon=True)
+                thread.start()
+                stack.callback(thread.join, STOPPING_S)
+            self.on_start()
+            stack.callback(self._stopped.set)  # called first: the threads stop side by side
+            yield from self._merged(end)
+
+    def _merged(self, end: float) -> Iterator[AnyFrame]:
+        left = True
+        while left and monotonic() < end:
+            arrival, left = self._next()
+            self.check()
+            self._tell()
+            frame = None if arrival is None else self._framed(arrival)
+            if frame is not None:
+                yield frame
+        failures = [feed.failure for feed in self._feeds if feed.failure]
+        if failures and len(failures) == len(self._feeds):
+            raise SourceError(failures[0])
+
+    def _next(self) -> tuple[Arrival[tuple[_Feed, AnyFrame]] | None, bool]:
+        """Return an image whose pose is there or will not come, if any, and whether more may come."""
+        with self._change:
+            arrival = self._waiting.pop(self._ready)
+            if arrival is not None:
+                return arrival, True
+            if not len(self._waiting) and all(feed.ended for feed in self._feeds):
+                return None, False
+            self._change.wait(SOON_S if len(self._waiting) else TICK_S)
+            return self._waiting.pop(self._ready), True
+
+    def _ready(self, arrival: Arrival[tuple[_Feed, AnyFrame]]) -> bool:
+        feed, frame = arrival.content
+        if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
+            return True
+        return self.poses.is_final(arrival.stamp_ns)
+
+    def _framed(self, arrival: Arrival[tuple[_Feed, AnyFrame]]) -> AnyFrame | None:
+        """Return an image with its pose, or with a fault that says why it has none; None before the first pose."""
+        feed, image = arrival.content
+        frame = replace(image, sensor=feed.name, stamp_ns=arrival.stamp_ns)
+        self.moment = feed.moments.pop(image.stamp_ns, Moment(feed.name, None, arrival.arrived_ns))
+        if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
+            return frame
+        if not self.poses.added:
+            feed.before_first_pose += 1
+            return None
+        try:
+            T_world_body = self.poses.at(frame.stamp_ns)
+        except FrameRefused as refused:
+            detail = f"{name_of(frame)}: {refused}"
+            nowhere = np.full((4, 4), np.nan)
+            return replace(frame, T_world_sensor=nowhere, fault=refused.reason, fault_detail=detail)
+        T_world_sensor = T_world_body @ feed.camera.T_body_camera
+        return replace(frame, T_world_sensor=T_world_sensor, fault=None, fault_detail="", pose_off_ns=0)
+
+    def _run(self, feed: _Feed) -> None:
+        """Put a camera's images into its queue until it ends or nobody wants more."""
+        try:
+            images = self._tracked(feed) if feed.tracked else self._noted(feed)
+            for image in images:
+                with self._change:
+                    self._waiting.put(feed.name, image.stamp_ns - feed.offset_ns, "", (feed, image))
+                    self._change.notify()
+                if self._stopped.is_set():
+                    break
+            close = getattr(images, "close", None)
+            if close:
+                close()
+        except StereovoxError as error:
+            feed.failure = str(error)
+        except Exception as error:  # a camera that breaks must be told, not vanish with its thread
+            feed.failure = f"{feed.name}: {type(error).__name__}: {error}"
+        feed.ended = True
+        if feed.tracked and self.poses is not None:
+            self.poses.end(feed.failure or "the tracked camera ended")
+        self._wake()
+
+    def _noted(self, feed: _Feed) -> Iterator[AnyFrame]:
+        """Yield a camera's images, and take note when they arrive."""
+        images = iter(feed.stream)
+        try:
+            for image in images:
+                arrived_ns, now_ns = monotonic_ns(), epoch_ns()
+                if feed.host_clock is None:
+                    feed.host_clock = 0 <= now_ns - image.stamp_ns <= HOST_CLOCK_NS
+                feed.received += 1
+                feed.moments[image.stamp_ns] = Moment(
+                    feed.name, image.stamp_ns if feed.host_clock else None, arrived_ns
+                )
+                while len(feed.moments) > REMEMBERED:
+                    feed.moments.popitem(last=False)
+                yield image
+                if self._stopped.is_set():
+                    return
+        finally:
+            close = getattr(images, "close", None)
+            if close:  # a generator: the camera is to stop now
+                close()
+
+    def _tracked(self, feed: _Feed) -> Iterator[AnyFrame]:
+        """Yield a camera's images with tracked poses, which become those of the body."""
+        poses = self.poses
+        assert poses is not None
+        feed.latest = Latest(self._noted(feed), UNTRACKED)
+        T_camera_body = inverse(feed.camera.T_body_camera)
+        tracker = _LateTracker(self.config, feed.stream)
+        for image, tracked in follow(feed.latest, tracker):
+            T = np.full((4, 4), np.nan) if tracked.lost else tracked.T_world_sensor @ T_camera_body
+            if not tracked.lost or poses.added:
+                poses.add(image.stamp_ns - feed.offset_ns, T)
+            self.imu_use = tracker.imu_use
+            yield image
+
+    def _wake(self) -> None:
+        with self._change:
+            self._change.notify()
+
+    def _tell(self) -> None:
+        """Tell the user what is wrong: cameras that failed, at once; a lack of poses, now and then."""
+        failed = [feed.failure for feed in self._feeds if feed.failure]
+        if len(failed) > self._told and len(failed) < len(self._feeds):
+            self._notify(f"{failed[-1]}; the other cameras go on")
+        self._told = len(failed)
+        now = monotonic()
+        if now < self._remind or self.poses is None:
+            return
+        self._remind = now + REMIND_S
+        trouble = self._stream.trouble if self._stream is not None else ""
+        if not self.poses.added:
+            self._notify(f"{trouble or f'{self.poses.where}: no pose has come yet'}; images wait for the first one")
+        elif trouble and self._stream is not None:
+            self._stream.trouble = ""
+            self._notify(trouble)
+
+
+class _LateTracker:
+    """A tracker that is made with the first image, which shows what is level."""
+
+    def __init__(self, config: Config, stream: Stream):
+        self._config, self._stream = config, stream
+        self._tracker: Tracker | None = None
+
+    def add(self, frame: AnyFrame, /) -> Tracked:
+        """Return the pose of a frame."""
+        if self._tracker is None:
+            start = level_pose(frame if isinstance(frame, Frame) else None, self._config)
+            self._tracker = Tracker(self._config, start=start, imu=imu_of(self._stream))
+        return self._tracker.add(frame)
+
+    @property
+    def imu_use(self) -> str:
+        """What was made of the IMU."""
+        return self._tracker.imu_use if self._tracker else ""
+
+
+def _feed(camera: LiveCamera) -> _Feed:
+    stream = open_camera(camera.source) if isinstance(camera.source, str | Path) else camera.source
+    return _Feed(camera, stream, round(1e9 * camera.clock_offset_s))

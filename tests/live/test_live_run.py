@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live cameras meet poses that arrive, and become one map."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from time import time_ns
+
+import numpy as np
+import pytest
+from made_live import Images, Sender, free_port, pose_at, udp_sender
+
+from stereovox.cli import main
+from stereovox.config import load_config
+from stereovox.depth.sphere import T_BODY_OPTICAL, surroundings
+from stereovox.errors import SourceError, StereovoxError
+from stereovox.formats.map_server import read_map_server
+from stereovox.live.rig import LiveCamera, mount_of
+from stereovox.live.run import LiveRun, map_live
+from stereovox.mapper import Mapper
+from stereovox.maps import load_map
+from stereovox.opening import open_source
+from stereovox.pose_choice import TRACK
+from stereovox.products.projection import project
+from stereovox.se3 import inverse
+from stereovox.sources.live_poses import LivePoses
+from stereovox.sources.paced import Paced
+from stereovox.sources.poses import Poses
+
+SMALL = {"voxel_size": 0.1, "max_range": 4.0}
+
+
+class Keeper:
+    """An observer that keeps what it sees, and can end a run."""
+
+    def __init__(self, after=None, act=None):
+        self.frames, self.reports, self.ends = [], [], []
+        self._after, self._act = after, act
+
+    def after(self, frame, report):
+        self.frames.append(frame)
+        self.reports.append(report)
+        if self._after is not None and len(self.frames) == self._after:
+            self._act()
+
+    def finish(self):
+        self.ends.append("finish")
+
+    def close(self):
+        self.ends.append("close")
+
+
+def test_images_meet_the_poses_of_a_udp_stream_through_mount_and_clock(tmp_path):
+    port, offset_s = free_port(), 100.0
+    camera = LiveCamera(
+        Images(count=20, offset_ns=100 * 10**9), "front", mount_of([0.2, 0, 0.1, 0, 0, 30]), clock_offset_s=offset_s
+    )
+    keeper = Keeper()
+    with Sender(udp_sender(port)) as sender:
+        done = map_live(camera, tmp_path / "a.svox", poses=f"udp://:{port}", observers=[keeper], **SMALL)
+    mapped = [frame for frame, report in zip(keeper.frames, keeper.reports, strict=True) if not report.refused]
+    assert len(mapped) >= 15
+    for frame in mapped:
+        assert frame.sensor == "front"
+        expected = pose_at(frame.stamp_ns, sender.begin_ns) @ camera.T_body_camera
+        np.testing.assert_allclose(frame.T_world_sensor, expected, atol=2e-6)
+    assert done.live["cameras"]["front"]["received"] == 20
+    assert done.live["poses"]["added"] > 20
+    assert done.summary()["frames"] == done.map.frames == len(mapped)
+    assert load_map(tmp_path / "a.svox").frames == done.map.frames
+    assert done.live["latency_ms"]["since"] == "arrival"  # stamps are 100 s off this machine's clock
+    assert keeper.ends == ["finish", "close"]
+
+
+def test_the_latency_is_counted_from_the_stamp_where_that_is_by_this_machines_clock(tmp_path):
+    poses = LivePoses()
+    with Sender(poses.add):
+        done = map_live(Images(), tmp_path / "a.svox", poses=poses, **SMALL)
+    latency = done.live["latency_ms"]
+    assert latency["since"] == "stamp"
+    assert 0 < latency["map"]["median"] <= latency["outputs"]["median"] < 10_000
+
+
+def test_two_cameras_become_one_map_which_is_that_of_the_same_frames_in_the_same_order(tmp_path):
+    cameras = [
+        LiveCamera(Images("a", 15, 0.02, distance_m=2.0), "left", mount_of([0, 0.1, 0, 0, 0, 90])),
+        LiveCamera(Images("b", 15, 0.03, distance_m=1.5), "right", mount_of([0, -0.1, 0, 0, 10, -90])),
+    ]
+    poses, keeper = LivePoses(), Keeper()
+    with Sender(poses.add):
+        done = map_live(cameras, tmp_path / "a.svox", poses=poses, observers=[keeper], **SMALL)
+    assert {frame.sensor for frame in keeper.frames} == {"left", "right"}
+    assert done.live["cameras"]["left"]["received"] == done.live["cameras"]["right"]["received"] == 15
+    assert not done.live["dropped"]
+    offline = Mapper(load_config("default", **SMALL))
+    for frame in keeper.frames:
+        offline.add(frame)
+    ours, theirs = done.map, offline.map
+    assert len(ours.occupied())
+    np.testing.assert_array_equal(ours.occupied(), theirs.occupied())
+    np.testing.assert_array_equal(ours.log_odds(ours.occupied()), theirs.log_odds(theirs.occupied()))
+    assert ours.counts() == theirs.counts()
+
+
+def test_an_image_whose_pose_does_not_come_is_refused_with_the_reason(tmp_path):
+    poses, silent = LivePoses("the tracker"), threading.Event()
+
+    def add(stamp_ns, T):
+        if not silent.is_set():
+            poses.add(stamp_ns, T)
+
+    keeper = Keeper(8, silent.set)
+    with Sender(add):
+        done = map_live(Images(count=20), tmp_path / "a.svox", poses=poses, wait_s=0.1, observers=[keeper], **SMALL)
+    refused = [report for report in done.reports if report.refused]
+    assert {report.refused for report in refused} == {"no_pose"}
+    assert 5 <= len(refused) <= 12
+    assert "the tracker: needs a pose" in refused[0].detail
+    assert done.map.frames == 20 - len(refused)
+
+
+def test_images_before_the_first_pose_wait_and_are_counted(tmp_path):
+    poses, keeper = LivePoses(), Keeper()
+    images = Images(count=30)
+    timer = threading.Timer(0.3, lambda: sender.__enter__())
+    sender = Sender(poses.add)
+    timer.start()
+    try:
+        done = map_live(images, tmp_path / "a.svox", poses=poses, wait_s=0.05, observers=[keeper], **SMALL)
+    finally:
+        timer.join()
+        sender.__exit__()
+    before = done.live["cameras"]["camera"]["before_first_pose"]
+    assert before >= 3
+    assert done.map.frames + done.map.frames_refused == 30 - before
+
+
+def test_no_pose_at_all_is_an_error_and_no_map(tmp_path):
+    with pytest.raises(StereovoxError, match="camera: not one frame could be used, no map is written"):
+        map_live(Images(count=3), tmp_path / "a.svox", poses=LivePoses(), wait_s=0.01, **SMALL)
+    assert not (tmp_path / "a.svox").exists()
+
+
+def test_a_camera_that_fails_does_not_end_the_others(tmp_path):
+    said = []
+    bad = Images("bad", 3, failure=SourceError("bad: no frame for 5 s; check cable"))
+    poses = LivePoses()
+    with Sender(poses.add):
+        done = map_live(
+            [LiveCamera(bad), LiveCamera(Images("good", 20))], tmp_path / "a.svox", poses=poses, notify=said.append,
+            **SMALL,
+        )  # fmt: skip
+    assert "bad: no frame for 5 s; check cable; the other cameras go on" in said
+    assert done.live["cameras"]["bad"]["failure"].startswith("bad: no frame")
+    assert done.live["cameras"]["good"]["received"] == 20
+
+
+def test_the_last_camera_that_fails_ends_the_run_and_the_map_is_saved(tmp_path):
+    poses, keeper = LivePoses(), Keeper()
+    bad = Images("bad", 5, failure=SourceError("bad: no frame for 5 s; check cable"))
+    with Sender(poses.add), pytest.raises(SourceError, match="check cable"):
+        map_live(bad, tmp_path / "a.svox", poses=poses, observers=[keeper], **SMALL)
+    assert load_map(tmp_path / "a.svox").frames == 5
+    assert keeper.ends == ["finish", "close"]
+
+
+def test_ctrl_c_ends_the_run_with_map_and_recording(tmp_path, obeys_signals):
+    poses, images = LivePoses(), Images(count=10_000)
+    keeper = Keeper(6, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    with Sender(poses.add):
+        done = map_live(
+            images, tmp_path / "a.svox", poses=poses, record=tmp_path / "log.mcap", observers=[keeper], **SMALL
+        )
+    assert done.stopped
+    assert load_map(tmp_path / "a.svox").frames == done.map.frames == 6
+    assert images.closed
+    assert done.live["recorded"]["images"] == 6
+    assert len(open_source(tmp_path / "log.mcap")) == 6
+
+
+def test_signals_act_while_no_image_comes(tmp_path, obeys_signals):
+    timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    timer.start()
+    with pytest.raises(StereovoxError, match="stopped before an image could be mapped"):
+        map_live(Images(count=10, period_s=1.0), tmp_path / "a.svox", poses=LivePoses(), **SMALL)
+    timer.join()
+    assert not (tmp_path / "a.svox").exists()
+
+
+def test_a_replayed_simulation_is_its_offline_map(tmp_path):
+    """With a 2-D map, the distances all round and a recording at once, all of the same map."""
+    name = "sim:room?frames=12&image_width=160"
+    keeper = Keeper()
+    outputs = {"grid": tmp_path / "g.yaml", "sphere": tmp_path / "s.png", "record": tmp_path / "log.mcap"}
+    done = map_live(
+        LiveCamera(name, "front"), tmp_path / "a.svox", observers=[keeper], heights=(0.2, 1.5), **outputs, **SMALL
+    )
+    assert done.poses == "given"
+    offline = Mapper(load_config("default", **SMALL))
+    for frame in open_source(name):
+        offline.add(frame)
+    np.testing.assert_array_equal(done.map.occupied(), offline.map.occupied())
+    assert done.map.counts() == offline.map.counts()
+    written, made = read_map_server(tmp_path / "g.yaml"), project(offline.map, (0.2, 1.5))
+    occupied = made.cells > 100 * made.occupied_above
+    assert (written.cells == 100).sum() == occupied.sum() > 0
+    assert (tmp_path / "s.png").stat().st_size > 1000
+    again = open_source(tmp_path / "log.mcap")
+    for frame, recorded in zip(keeper.frames, again, strict=True):
+        np.testing.assert_allclose(recorded.T_world_sensor, frame.T_world_sensor, atol=1e-9)
+        np.testing.assert_array_equal(recorded.depth, frame.depth)
+        assert recorded.stamp_ns == frame.stamp_ns
+
+
+def test_the_distances_all_round_are_those_of_all_cameras(tmp_path):
+    cameras = [
+        LiveCamera(Images("a", 8, distance_m=2.0), "ahead"),
+        LiveCamera(Images("b", 8, distance_m=1.0), "behind", mount_of([0, 0, 0, 0, 0, 180])),
+    ]
+    poses = LivePoses()
+    with (
+        Sender(lambda stamp_ns, T: poses.add(stamp_ns, np.eye(4))),
+        LiveRun(cameras, tmp_path / "a.svox", poses=poses, **SMALL) as run,
+    ):
+        run.add_outputs(sphere=True)
+        run.finish()
+    assert run.sphere is not None
+    grid, now_ns = run.sphere.grid()
+    sights = surroundings(grid)
+    assert sights["front"].range_m == pytest.approx(2.0, abs=0.05)
+    assert sights["back"].range_m == pytest.approx(1.0, abs=0.05)
+    assert sights["left"] is None
+    assert now_ns == grid.stamp_ns.max()
+
+
+def test_a_tracked_camera_moves_the_others(tmp_path):
+    """The second camera has no poses: it looks back from a mount, and sees its wall behind."""
+    keeper = Keeper()
+    front = Paced(open_source("sim:room?image_width=212", frames=":12"))
+    behind = LiveCamera(Images("b", 30, 1 / 30, distance_m=1.0), "back", mount_of([-0.1, 0, 0, 0, 0, 180]))
+    cameras = [LiveCamera(front, "front"), behind]
+    done = map_live(cameras, tmp_path / "a.svox", poses=TRACK, observers=[keeper], **SMALL)
+    assert done.poses == "track"
+    front = [frame for frame in keeper.frames if frame.sensor == "front" and not frame.fault]
+    back = [frame for frame in keeper.frames if frame.sensor == "back" and not frame.fault]
+    assert len(front) >= 8
+    assert len(back) >= 2
+    known = Poses([frame.stamp_ns for frame in front], [frame.T_world_sensor for frame in front])
+    for frame in back:
+        T_world_body = known.at(frame.stamp_ns) @ inverse(T_BODY_OPTICAL)
+        np.testing.assert_allclose(frame.T_world_sensor, T_world_body @ behind.T_body_camera, atol=1e-9)
+
+
+def test_a_tracked_map_cannot_be_resumed(tmp_path):
+    poses = LivePoses()
+    with Sender(poses.add):
+        map_live(Images(), tmp_path / "a.svox", poses=poses, **SMALL)
+    with pytest.raises(StereovoxError, match="does not know where in it it is"):
+        map_live(Images(), tmp_path / "a.svox", poses=TRACK, resume=True)
+
+
+def test_a_map_with_poses_from_elsewhere_is_resumed(tmp_path):
+    poses = LivePoses()
+    with Sender(poses.add):
+        first = map_live(Images(), tmp_path / "a.svox", poses=poses, **SMALL)
+        second = map_live(Images(), tmp_path / "a.svox", poses=poses, resume=True)
+    assert second.map.frames == 20 >= first.map.frames
+
+
+def test_the_command_maps_a_file_of_cameras_and_says_what_became_of_them(tmp_path, capsys):
+    (tmp_path / "live.toml").write_text(
+        'poses = "given"\n[[camera]]\nname = "front"\nsource = "sim:room?frames=6&image_width=160"\n'
+        '[[camera]]\nname = "also"\nsource = "sim:room?frames=6&image_width=96"\nmount = [0, 0, 0, 0, 0, 0]\n'
+    )
+    words = ["live", str(tmp_path / "live.toml"), "--out", str(tmp_path / "a.svox"), "--json"]
+    assert main([*words, "--view", "0", "--set", "voxel_size=0.1"]) == 0
+    out, err = capsys.readouterr()
+    result = json.loads(out.splitlines()[-1])
+    assert result["frames"] == 12
+    assert result["live"]["cameras"]["also"] == {"received": 6, "dropped": 0, "before_first_pose": 0}
+    assert set(result["live"]["latency_ms"]["map"]) == {"median", "p90", "p99", "max"}
+    assert "in a browser to see the map grow" in err
+    assert "front: 6 images came, 0 dropped" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["sim:room", "--mount", "1,2"], "--mount 1,2: a mount is x, y, z, roll, pitch, yaw"),
+        (["sim:room", "--mount", "a,b"], "--mount a,b: write X,Y,Z,ROLL,PITCH,YAW"),
+        (["sim:room", "--poses", "gps"], "poses 'gps' is unknown; give track, given, t265, udp://:5005"),
+        (["sim:room", "--poses", "udp://:nine"], "udp://:nine: write udp://HOST:PORT"),
+        (["sim:room", "--poses", "udp://:9?axes=enu"], "udp://:9?axes=enu: axes=enu is unknown"),
+        (["sim:room", "--sphere", "a.jpg"], "--sphere a.jpg: end the file's name with .png"),
+        (["sim:room", "--record", "a.zip"], "a.zip: end the name of a recording in .mcap"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(words, message, tmp_path, capsys):
+    assert main(["live", *words, "--out", str(tmp_path / "a.svox")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.svox").exists()
+
+
+def test_the_command_is_ended_by_sigterm_and_saves(tmp_path):
+    command = [sys.executable, "-m", "stereovox", "live", "sim:room?image_width=96", "--out", str(tmp_path / "a.svox")]
+    run = subprocess.Popen(
+        [*command, "--json", "--grid", str(tmp_path / "g.yaml"), "--set", "voxel_size=0.1"], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        deadline = time_ns() + 120 * 10**9
+        while not (tmp_path / "g.yaml").exists() and time_ns() < deadline and run.poll() is None:
+            pass
+        run.send_signal(signal.SIGTERM)
+        out, err = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 0, err
+    result = json.loads(out.splitlines()[-1])
+    assert load_map(tmp_path / "a.svox").frames == result["frames"] > 0
+
+
+def test_a_realsense_camera_and_its_poses_through_pyrealsense2s_software_device(tmp_path, monkeypatch):
+    rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 has no wheel for this Python", exc_type=ImportError)
+    import made_realsense as made
+
+    camera, poses = made.SoftwareCamera(rs), LivePoses("tracker")
+    monkeypatch.setattr(rs, "context", lambda: camera)
+    for k in range(2000):
+        poses.add(made.stamp_ns(k) + 1_000_000, np.eye(4))  # between two poses each image is
+    keeper = Keeper(20, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    with camera.sending():
+        done = map_live("realsense:042?imu=off", tmp_path / "a.svox", poses=poses, observers=[keeper], **SMALL)
+    assert done.map.frames == 20 - sum(bool(report.refused) for report in keeper.reports) > 10
+    assert done.live["cameras"]["realsense:042?imu=off"]["received"] >= 20
+    for frame in keeper.frames:
+        number = int(frame.name.rpartition(" ")[2])
+        np.testing.assert_array_equal(frame.depth, made.depth(number))
+        assert abs(frame.stamp_ns - made.stamp_ns(number)) < 1000  # milliseconds in a float
+    with pytest.raises(RuntimeError, match="not streaming"):
+        camera.sensor.stop()
+
+
+def test_a_realsense_camera_without_poses_is_tracked(tmp_path, monkeypatch):
+    rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 has no wheel for this Python", exc_type=ImportError)
+    import made_realsense as made
+
+    camera = made.SoftwareCamera(rs)
+    monkeypatch.setattr(rs, "context", lambda: camera)
+    with LiveRun("realsense:042", tmp_path / "a.svox") as run:
+        assert run.stream.tracked

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outputs of a growing map: files of the 2-D map that are written anew, recordings that do not hold the map up."""
+
+import json
+import threading
+
+import numpy as np
+import pytest
+from made_live import CAMERA, wall
+
+from stereovox.depth.sphere import T_BODY_OPTICAL
+from stereovox.errors import SourceError, StereovoxError
+from stereovox.formats.map_server import read_map_server
+from stereovox.frame import Frame, UpdateReport
+from stereovox.live.latency import Latency
+from stereovox.live.outputs import GridFile, LiveSphere
+from stereovox.live.recorder import WAITING, Recorder, optical, topic
+from stereovox.live.stream import Moment
+from stereovox.mapper import Mapper
+from stereovox.opening import open_source
+from stereovox.sources.wall_clock import epoch_ns
+
+MS = 1_000_000
+SETTINGS = {"voxel_size": 0.1, "max_range": 4.0}
+
+
+def frame(k=0, sensor="front", depth=None):
+    T = np.eye(4)
+    T[2, 3] = 1.0
+    depth = wall(2.0, seed=k) if depth is None else depth
+    return Frame(depth, CAMERA, T @ T_BODY_OPTICAL, 10**18 + 33 * MS * k, 0.001, name=f"frame {k}", sensor=sensor)
+
+
+def test_the_2d_map_is_written_while_it_grows_and_complete_at_the_end(tmp_path):
+    mapper = Mapper(**SETTINGS)
+    grid = GridFile(mapper, tmp_path / "g.yaml", (0.2, 1.8), period_s=0.0)
+    for k in range(8):
+        grid.after(frame(k), mapper.add(frame(k)))
+    grid.finish()
+    grid.close()
+    assert grid.written >= 2
+    found = read_map_server(tmp_path / "g.yaml")
+    assert (found.cells == 100).sum() > 5
+    assert (found.cells == 0).sum() > 50
+
+
+def test_a_2d_map_that_cannot_be_written_does_not_end_the_run(tmp_path):
+    mapper, said = Mapper(**SETTINGS), []
+    (tmp_path / "sub").mkdir()
+    grid = GridFile(mapper, tmp_path / "sub" / "g.yaml", period_s=0.0, notify=said.append)
+    (tmp_path / "sub").rmdir()
+    grid.after(frame(), mapper.add(frame()))
+    grid.finish()
+    grid.close()
+    assert any("g.yaml" in line for line in said)
+    with pytest.raises(StereovoxError, match="give a name that ends in"):
+        GridFile(mapper, tmp_path / "g.jpg")
+
+
+def test_refused_images_do_not_enter_the_distances_all_round(tmp_path):
+    sphere = LiveSphere(Mapper(**SETTINGS).config, {"front": T_BODY_OPTICAL})
+    sphere.after(frame(), UpdateReport(refused="no_pose"))
+    assert not sphere.known
+    with pytest.raises(StereovoxError, match="no image has been mapped yet"):
+        sphere.grid()
+    sphere.after(frame(), UpdateReport())
+    assert sphere.known
+
+
+def test_a_slow_disk_costs_images_of_the_recording_not_of_the_map(tmp_path, monkeypatch):
+    go_on, entered = threading.Event(), threading.Event()
+    slow = Recorder._write
+
+    def write(self, one):
+        entered.set()
+        go_on.wait(30)
+        slow(self, one)
+
+    monkeypatch.setattr(Recorder, "_write", write)
+    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL})
+    recorder.after(frame(), UpdateReport())
+    assert entered.wait(30)
+    for k in range(1, WAITING + 6):
+        recorder.after(frame(k), UpdateReport())
+    go_on.set()
+    recorder.finish()
+    assert recorder.counts == {"images": WAITING + 1, "skipped": 5}
+    assert len(open_source(tmp_path / "log.mcap")) == WAITING + 1
+
+
+def test_a_full_disk_ends_the_recording_alone(tmp_path, monkeypatch):
+    said = []
+
+    def full(self, *args, **more):
+        raise SourceError("log.mcap: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("stereovox.sources.bags.writer.BagWriter.depth", full)
+    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL}, notify=said.append)
+    for k in range(3):
+        recorder.after(frame(k), UpdateReport())
+    recorder.close()
+    assert said == ["log.mcap: cannot be written (No space left on device); nothing is recorded, mapping goes on"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_images_without_a_pose_are_recorded_too(tmp_path):
+    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL})
+    recorder.after(frame(0), UpdateReport())
+    lost = Frame(wall(2.0), CAMERA, np.full((4, 4), np.nan), 10**18 + 33 * MS, 0.001, sensor="front", fault="no_pose")
+    recorder.after(lost, UpdateReport(refused="no_pose"))
+    recorder.after(frame(2, depth=np.empty((0, 0), np.uint16)), UpdateReport(refused="unreadable"))
+    recorder.finish()
+    assert recorder.counts == {"images": 2, "unsuitable": 1}
+    first, second = open_source(tmp_path / "log.mcap")
+    assert not first.fault
+    assert second.pose_off_ns == 33 * MS  # nobody said where: the reader tells how far it had to guess
+
+
+def test_nothing_is_left_of_a_recording_without_images(tmp_path):
+    Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL}).close()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "word"), [("front", "front"), ("realsense:042?imu=off", "realsense_042_imu_off"), ("1", "camera_1")]
+)
+def test_names_become_topics(name, word):
+    assert topic(name) == word
+    assert optical(name) == f"{word}_depth_optical_frame"
+
+
+def test_two_cameras_of_one_topic_are_refused(tmp_path):
+    with pytest.raises(StereovoxError, match="have one topic"):
+        Recorder(tmp_path / "log.mcap", {"a b": T_BODY_OPTICAL, "a:b": T_BODY_OPTICAL})
+
+
+def test_latency_counts_images_that_were_mapped_from_their_stamp():
+    moments = [Moment("a", epoch_ns() - 10**9, 0)]
+    latency = Latency(lambda: moments[0])
+    for refused in (None, "no_pose", None):
+        latency.mapped.after(None, UpdateReport(refused=refused))
+    latency.sent.after(None, UpdateReport())
+    found = latency.summary()
+    assert 1000 <= found["map"]["median"] < 30_000
+    assert found["map"]["max"] <= found["outputs"]["max"]
+    assert found["since"] == "stamp"
+    assert len(latency._map_ms) == 2
+    json.dumps(found)

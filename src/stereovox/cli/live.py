@@ -26,8 +26,7 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.live.rig import LiveCamera
-    from stereovox.live.run import LiveResult, LiveRun
-    from stereovox.run import Observer
+    from stereovox.live.run import LiveResult
 
 EXAMPLE = "stereovox live realsense: --poses udp://:5005 --out room.svox --view"
 PORT = 8080
@@ -41,8 +40,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write")
     about = "track: by the first camera's images; given: those of a recording; t265; udp://[HOST]:PORT or"
     parser.add_argument(
-        "--poses", metavar="FROM", help=f"{about} tcp://HOST:PORT: lines, axes behind ?axes= (given, else track)"
-    )
+        "--poses", metavar="FROM",
+        help=f"{about} tcp://HOST:PORT: lines, axes behind ?axes=; mavlink:URL: an autopilot's (given, else track)",
+    )  # fmt: skip
     parser.add_argument(
         "--mount", metavar="X,Y,Z,ROLL,PITCH,YAW",
         help="where the camera is on the body (x forward, y left, z up): metres and degrees (at its origin, ahead)",
@@ -62,6 +62,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--view", type=int, nargs="?", const=PORT, metavar="PORT",
         help=f"show the map in a browser while it grows ({PORT}; 0: any free port)",
     )  # fmt: skip
+    about = "tell an autopilot at this address (udpout:127.0.0.1:14540) of obstacles: OBSTACLE_DISTANCE"
+    parser.add_argument("--mavlink", metavar="URL", help=about)
     parser.add_argument("--resume", action="store_true", help="continue the map at --out, in the world of its poses")
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
@@ -87,25 +89,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
             silence_server_log()
         live.add_outputs(
             grid=arguments.grid, heights=heights_of(arguments.heights), sphere=arguments.sphere,
-            record=arguments.record, view=arguments.view,
+            record=arguments.record, view=arguments.view, mavlink=arguments.mavlink,
         )  # fmt: skip
         if live.page:
             say(f"open {live.page} in a browser to see the map grow")
-        observers = _observers(arguments, live)
         say("mapping; Ctrl-C ends")
-        done = live.finish([*observers, stack.enter_context(progress_of(None, "mapping"))])
+        done = live.finish([stack.enter_context(progress_of(None, "mapping"))])
     result = done.summary()
     _print_result(result, done, arguments)
     return result
-
-
-def _observers(arguments: Namespace, live: LiveRun) -> list[Observer]:
-    """Return what else hears of each image, before all other outputs: what talks to an autopilot belongs here.
-
-    Each may have `finish` and `close` as well (`live.outputs.Output`). `live.mapper` is there, and `live.sphere` with
-    --sphere, or after `live.add_outputs(sphere=True)`.
-    """
-    return []
 
 
 def _cameras(arguments: Namespace) -> str | LiveCamera:
@@ -145,6 +137,8 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     for what, file in (("2-D map", arguments.grid), ("distances all round", arguments.sphere)):
         if file:
             say(f"{what}: {file}")
+    if "obstacle_distances" in live:
+        say(f"{live['obstacle_distances']} obstacle distances sent to {arguments.mavlink}")
     if "recorded" in live:
         counts = ", ".join(f"{count} {what}" for what, count in live["recorded"].items()) or "nothing"
         say(f"recorded in {arguments.record}: {counts}")

@@ -12,6 +12,7 @@ POSES = {
     "udp": "stereovox.sources.pose_stream:UdpPoses",
     "tcp": "stereovox.sources.pose_stream:TcpPoses",
     "t265": "stereovox.sources.pose_stream:T265",
+    "mavlink": "stereovox.mavlink.stream:MavlinkPoses",
 }
 """Streams of poses (`PoseStream`), asked in this order, then entry points in the group `stereovox.poses`."""
 
@@ -26,5 +27,5 @@ def open_poses(where: str) -> PoseStream:
         kind = registry.find("poses", POSES, name)
         if kind.recognises(where):
             return kind(where)
-    words = f"{TRACK}, {GIVEN}, t265, udp://:5005 or tcp://HOST:5005"
+    words = f"{TRACK}, {GIVEN}, t265, udp://:5005, tcp://HOST:5005 or mavlink:udpin:0.0.0.0:14540"
     raise SourceError(f"poses '{where}' is unknown; give {words}")

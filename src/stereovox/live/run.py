@@ -23,12 +23,14 @@ from stereovox.live.rig import LiveCamera, read_live
 from stereovox.live.stream import WAIT_S, LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
+from stereovox.mavlink.sending import ObstacleSender
+from stereovox.mavlink.stream import MavlinkPoses
 from stereovox.pose_choice import GIVEN, TRACK
 from stereovox.products.floor_axes import Heights
 from stereovox.run import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
 from stereovox.sources.base import Stream
 from stereovox.sources.live_poses import LivePoses
-from stereovox.sources.pose_stream import PoseStream
+from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.warm_up import warm_up
 
 Cameras = str | Path | Stream | LiveCamera | Sequence[LiveCamera]
@@ -78,6 +80,7 @@ def map_live(
     sphere: str | Path | None = None,
     record: str | Path | None = None,
     view: int | None = None,
+    mavlink: str | None = None,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
     notify: Callable[[str], None] = lambda line: None,
@@ -104,6 +107,8 @@ def map_live(
         sphere: Picture of the distances all round to draw at the end (`.png`).
         record: Recording to write beside (`.mcap`, `.bag` or `.db3`).
         view: Port of a page that shows the map while it grows; 0: any free port. None: no page.
+        mavlink: Address of an autopilot that gets obstacle distances (`ObstacleSender`), such as
+            `udpout:127.0.0.1:14540`; where poses come from it too, the same address.
         checkpoint_s: Seconds between two saves; 0: save only at the end.
         observers: Called after each image, before the other outputs.
         notify: Called with each line that a user should see.
@@ -119,7 +124,7 @@ def map_live(
     given: dict[str, Any] = {"poses": poses, "profile": profile, "resume": resume, "wait_s": wait_s}
     given |= {"seconds": seconds, "checkpoint_s": checkpoint_s, "notify": notify}
     with LiveRun(cameras, out, **given, **overrides) as run:
-        run.add_outputs(grid=grid, heights=heights, sphere=sphere, record=record, view=view)
+        run.add_outputs(grid=grid, heights=heights, sphere=sphere, record=record, view=view, mavlink=mavlink)
         return run.finish(observers)
 
 
@@ -165,6 +170,7 @@ class LiveRun:
         self._open = ExitStack()
         self.outputs: list[Output] = []
         self._recorder: Recorder | None = None
+        self._sender: ObstacleSender | None = None
         self.sphere: LiveSphere | None = None
         self._page: list[Output] = []
         self.page = ""
@@ -173,6 +179,7 @@ class LiveRun:
         poses = self._poses
         words = (None, GIVEN, TRACK)
         opened = open_poses(poses) if isinstance(poses, str) and poses not in words else poses
+        self._opened = opened
         self.stream = LiveStream(self._cameras, opened, **self._live)
         if self._resume and self.stream.tracked:
             raise StereovoxError(f"{self.out}: a tracked camera does not know where in it it is; begin a new map")
@@ -196,6 +203,7 @@ class LiveRun:
         sphere: str | Path | bool | None = None,
         record: str | Path | None = None,
         view: int | None = None,
+        mavlink: str | None = None,
     ) -> None:
         """Add outputs, as the arguments of `map_live` of the same names.
 
@@ -204,8 +212,12 @@ class LiveRun:
             sphere: True: keep the distances without drawing a picture.
 
         Raises:
-            StereovoxError: One of them cannot be written, the page cannot be served, or the map is not level.
+            StereovoxError: One of them cannot be written, the page cannot be served, the map is not level, or the
+                autopilot's address cannot be used.
         """
+        if mavlink is not None:
+            self._sender = self._obstacle_sender(mavlink)
+            self._add(self._sender)
         if sphere:
             picture = None if sphere is True else sphere
             self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture)
@@ -262,9 +274,22 @@ class LiveRun:
             "dropped": self.stream.dropped,
             **self.stream.counts(),
         }
+        if self._sender is not None:
+            live["obstacle_distances"] = self._sender.sent
         if self._recorder is not None:
             live["recorded"] = dict(self._recorder.counts)
         return LiveResult(self.mapper.map, self.out, reports.reports, stopped, live, self._poses_word())
+
+    def _obstacle_sender(self, url: str) -> ObstacleSender:
+        """Return what tells an autopilot of obstacles, over the connection that brings its poses if it is the same."""
+        poses = self._opened
+        if isinstance(poses, MavlinkPoses) and poses.url == url:
+            self._open.callback(poses.stop)
+            url_or_link = poses.link
+        else:
+            url_or_link = url
+        mounts = {name: T_OPTICAL_BODY @ T_body_camera for name, T_body_camera in self.stream.mounts.items()}
+        return ObstacleSender(self.mapper, url_or_link, mounts=mounts, tell=self._notify)
 
     def _add(self, output: Output) -> None:
         self.outputs.append(output)

@@ -7,7 +7,8 @@ Two processes on loopback: this one sends simulated 848x480 images (16UC1), came
 with the clock on the wall, and listens to the 2-D map; the other is the node. Latency: from an image's stamp to the
 arrival of a map with that stamp here, so sending, waiting for the pose, mapping, publishing and receiving are in it.
 `cpu`: CPU time of the node's process, as a share of one core and in milliseconds a frame; other work on the machine
-disturbs it less than the latency. --listen cells: take the cloud and the OctoMap as well, once a second.
+disturbs it less than the latency. --listen cells: take the cloud and the OctoMap as well, once a second; nav2: the
+obstacles and the free rays, ten times a second.
 """
 
 from __future__ import annotations
@@ -26,21 +27,20 @@ from typing import Any
 import numpy as np
 import psutil
 import rclpy
-from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from tf2_msgs.msg import TFMessage
 
 import stereovox as sv
 from stereovox.ros.outputs import header
-from stereovox.se3 import rotation_vector
+from stereovox.ros.tf_message import packed_transforms, tf_message
 from stereovox.sources.bags.messages import Wire
 
 KEPT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 TF_HZ, FRAMES = 100, 90
+SOURCE = "sim:room"
 PROFILE = Path(__file__).resolve().parents[1] / "examples/ros2/large_images.xml"
 """For both processes; FASTDDS_DEFAULT_PROFILES_FILE="" measures without it."""
 WARM_S = 3.0
@@ -48,9 +48,9 @@ WARM_S = 3.0
 PERCENTILES = (50, 90, 99, 100)
 
 
-def images() -> tuple[list[tuple[Image, np.ndarray]], CameraInfo]:
+def images(where: str) -> tuple[list[tuple[Image, np.ndarray]], CameraInfo]:
     """Messages of a piece of the flight, forth and back, T_world_camera of each, and their camera."""
-    source = sv.open_source("sim:room")
+    source = sv.open_source(where)
     found = []
     for i in range(FRAMES):
         frame = source.frame(i)
@@ -64,27 +64,19 @@ def images() -> tuple[list[tuple[Image, np.ndarray]], CameraInfo]:
     return [*found, *found[-2:0:-1]], info
 
 
-def transform(T: np.ndarray, stamp_ns: int) -> TFMessage:
-    told = TransformStamped(header=header(stamp_ns, "map"), child_frame_id="camera")
-    place, turn = told.transform.translation, told.transform.rotation
-    place.x, place.y, place.z = T[:3, 3].tolist()
-    vector = rotation_vector(T[:3, :3])
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle else vector
-    turn.x, turn.y, turn.z = (np.sin(angle / 2) * axis).tolist()
-    turn.w = float(np.cos(angle / 2))
-    return TFMessage(transforms=[told])
+def transform(T: np.ndarray, stamp_ns: int) -> bytes:
+    return packed_transforms(stamp_ns, [("map", "camera", T)])
 
 
 class Sender:
     """Sends images and transforms at their times, each with the pose that belongs to it."""
 
-    def __init__(self, node: Any, hz: float):
-        self._frames, self._info = images()
+    def __init__(self, node: Any, hz: float, where: str = SOURCE):
+        self._frames, self._info = images(where)
         self._hz = hz
         self._image = node.create_publisher(Image, "/camera/image", SENSOR)
         self._infos = node.create_publisher(CameraInfo, "/camera/camera_info", SENSOR)
-        self._tf = node.create_publisher(TFMessage, "/tf", 100)
+        self._tf = node.create_publisher(tf_message(), "/tf", 100)
         self.sent: list[int] = []
         self._k = 0
 
@@ -111,10 +103,13 @@ class Sender:
 class Listener:
     """Notes when a map of which stamp came."""
 
-    def __init__(self, node: Any, cells: bool):
+    def __init__(self, node: Any, listen: str):
         self.came: dict[int, int] = {}
         node.create_subscription(OccupancyGrid, "/map_mapping", self._take, KEPT, raw=True)
-        if cells:
+        if listen == "nav2":
+            for topic in ("/obstacles", "/free_rays"):
+                node.create_subscription(PointCloud2, topic, lambda data: None, 1, raw=True)
+        if listen == "cells":
             from octomap_msgs.msg import Octomap
 
             node.create_subscription(PointCloud2, "/occupied_cells", lambda data: None, KEPT, raw=True)
@@ -128,12 +123,12 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Run both processes and return the figures."""
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    sender, listener = Sender(node, arguments.hz), Listener(node, arguments.listen == "cells")
+    sender, listener = Sender(node, arguments.hz, arguments.source), Listener(node, arguments.listen)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
     options = arguments.options or ["--set", "voxel_size=0.05"]
-    command = [sys.executable, "-m", "stereovox", "ros2", "--depth", "/camera/image", *options, "--json"]
+    command = [sys.executable, "-m", "stereovox", "ros2", "--json", "--depth", "/camera/image", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         while not node.count_subscribers("/camera/image"):
             time.sleep(0.05)
@@ -165,7 +160,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--hz", type=float, default=30.0)
-    parser.add_argument("--listen", choices=("map", "cells"), default="map")
+    parser.add_argument("--listen", choices=("map", "cells", "nav2"), default="map")
+    parser.add_argument("--source", default=SOURCE, help="simulation whose images are sent")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("options", nargs="*", help="of stereovox ros2, behind --")
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from stereovox.rebuild import CorrectionReport as CorrectionReport
     from stereovox.remapping import Remapped as Remapped
     from stereovox.remapping import remap as remap
+    from stereovox.ros.nav2 import write_nav2 as write_nav2
     from stereovox.run import MapResult as MapResult
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
@@ -158,6 +159,7 @@ _HOMES = {
     "surface": "formats.meshes",
     "FloorRun": "floor_run",
     "map_floor": "floor_run",
+    "write_nav2": "ros.nav2",
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",

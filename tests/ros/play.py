@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plays a bag on ROS 2 topics, as `ros2 bag play` does: python play.py BAG RATE clock|no TOPIC.
+"""Plays a bag on ROS 2 topics, as `ros2 bag play` does: python play.py BAG RATE clock|no TOPIC...
 
-Waits until a node listens, and in the end until it has taken in all of TOPIC: its diagnostics say so.
+Waits until a node listens, and in the end until it has taken in all of TOPIC...: its diagnostics say so.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from stereovox.ros.tf_message import tf_message
 from stereovox.sources.bags import open_bag
 
 PATIENCE_S = 60.0
@@ -24,6 +25,8 @@ LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def kind_of(name: str) -> type:
+    if name == "tf2_msgs/TFMessage":
+        return tf_message()
     package, _, message = name.partition("/")
     return getattr(import_module(f"{package}.msg"), message)
 
@@ -36,7 +39,7 @@ def wait(node: Node, holds: Callable[[], object], said: str) -> None:
         rclpy.spin_once(node, timeout_sec=0.05)
 
 
-def main(path: str, rate: float, clock: bool, mapped: str) -> None:
+def main(path: str, rate: float, clock: bool, mapped: list[str]) -> None:
     file = open_bag(Path(path))
     rclpy.init(args=[])
     node = rclpy.create_node("player")
@@ -45,7 +48,9 @@ def main(path: str, rate: float, clock: bool, mapped: str) -> None:
         for topic, kind in file.types.items()
     }
     ticks = node.create_publisher(kind_of("rosgraph_msgs/Clock"), "/clock", 10) if clock else None
-    wanted = [one for topic, one in publishers.items() if topic in ("/tf", "/odom", mapped)]
+    wanted = [
+        publishers[topic] for topic in ("/tf" if "/tf" in publishers else "/odom", *mapped) if topic in publishers
+    ]
     told: dict[str, str] = {}
 
     def take(message: DiagnosticArray) -> None:
@@ -61,10 +66,10 @@ def main(path: str, rate: float, clock: bool, mapped: str) -> None:
         if ticks is not None:
             ticks.publish(kind_of("rosgraph_msgs/Clock")(clock=rclpy.time.Time(nanoseconds=stamp_ns).to_msg()))
         publishers[topic].publish(bytes(file.read(topic, i).block(0).obj))
-    count = str(len(file.stamps(mapped)))
+    count = str(sum(len(file.stamps(topic)) for topic in mapped))
     wait(node, lambda: (told["received"], told["waiting"]) == (count, "0"), "not all was taken in")
     rclpy.shutdown()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], float(sys.argv[2]), sys.argv[3] == "clock", sys.argv[4])
+    main(sys.argv[1], float(sys.argv[2]), sys.argv[3] == "clock", sys.argv[4:])

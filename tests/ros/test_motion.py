@@ -13,6 +13,8 @@ pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereo
 
 from stereovox.ros import motion
 from stereovox.ros.tracking import Moved
+from stereovox.sources.bags.messages import Wire
+from stereovox.sources.bags.robot_messages import read_transforms
 
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 """A quarter turn to the left about z, at (1, 2, 3)."""
@@ -57,18 +59,18 @@ def test_odometry_has_the_order_of_ros_and_no_speed():
 
 @pytest.fixture
 def with_tf2(monkeypatch):
-    """tf2_msgs is not on PyPI: a stand-in."""
-    monkeypatch.setattr(motion, "optional_message", lambda *_: SimpleNamespace)
+    """A class of messages is there; what is published are bytes."""
+    monkeypatch.setattr(motion, "tf_message", lambda: SimpleNamespace)
 
 
 def test_the_transform_is_that_of_the_odometry(with_tf2):
     node = Node()
     motion.MotionPublisher(node, with_tf=True).publish(moved())
-    (message,) = node.sent["/tf"]
-    (one,) = message.transforms
+    (data,) = node.sent["/tf"]
+    (one,) = read_transforms(Wire(data, cdr=True))
     pose = node.sent["tracked_odometry"][0].pose.pose
-    assert (one.header.frame_id, one.child_frame_id) == ("odom", "base_link")
-    assert numbers(one.transform.translation, one.transform.rotation) == numbers(pose.position, pose.orientation)
+    assert (one.stamp_ns, one.parent, one.child) == (7_000_000_009, "odom", "base_link")
+    assert list(one.numbers) == numbers(pose.position, pose.orientation)
 
 
 def test_a_transform_that_another_node_publishes_is_left_to_it(with_tf2):
@@ -80,11 +82,11 @@ def test_a_transform_that_another_node_publishes_is_left_to_it(with_tf2):
 
 
 def test_without_tf2_msgs_or_where_it_is_not_wanted_there_is_odometry_alone(monkeypatch):
-    monkeypatch.setattr(motion, "optional_message", lambda *_: None)
+    monkeypatch.setattr(motion, "tf_message", lambda: None)
     node = Node()
     motion.MotionPublisher(node, with_tf=True).publish(moved())
     assert (list(node.sent), len(node.said)) == (["tracked_odometry"], 1)
-    monkeypatch.setattr(motion, "optional_message", lambda *_: SimpleNamespace)
+    monkeypatch.setattr(motion, "tf_message", lambda: SimpleNamespace)
     node = Node()
     motion.MotionPublisher(node, with_tf=False).publish(moved())
     assert (list(node.sent), node.said) == (["tracked_odometry"], [])

@@ -31,10 +31,11 @@ from stereovox.ros.mapping import Mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402
 from stereovox.ros.options import Options, freeze  # noqa: E402
 from stereovox.ros.poses import fixed_transform  # noqa: E402
+from stereovox.ros.tf_message import tf_message  # noqa: E402
 from stereovox.se3 import from_quaternion, inverse  # noqa: E402
 from stereovox.simulate.simulation import Simulation  # noqa: E402
 
-TFMessage = optional_message("tf2_msgs", "TFMessage")
+TFMessage = tf_message()
 Octomap = optional_message("octomap_msgs", "Octomap")
 MOUNT = f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708"
 BY_TF = {"odometry": (), "fixed": ()} if TFMessage else {"odometry": ("/odom",), "fixed": (MOUNT,)}
@@ -215,7 +216,7 @@ def test_a_frame_whose_pose_never_comes_is_refused_and_counted(robot):
 
 
 def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
-    monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
+    monkeypatch.setattr("stereovox.ros.subscriptions.tf_message", lambda: None)
     other = rclpy.create_node("no_tf")
     options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(MOUNT,))
     mapping, reports = Mapping(load_config(voxel_size=0.1)), []
@@ -236,7 +237,7 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
 
 
 def test_without_tf2_msgs_and_any_other_pose_the_node_says_so_at_once(robot, monkeypatch):
-    monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
+    monkeypatch.setattr("stereovox.ros.subscriptions.tf_message", lambda: None)
     other = rclpy.create_node("no_poses")
     with pytest.raises(StereovoxError, match=r"^no poses: tf2_msgs is not installed.*--odometry") as error:
         MapNode(other, Mapping(load_config(voxel_size=0.1)), Options(depth=(DEPTH,)), str)
@@ -371,4 +372,41 @@ def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
     assert older.result == LoadMap.Response.RESULT_INVALID_MAP_DATA
     maker.close()
     robot.maker = first
+    other.destroy_node()
+
+
+def test_several_cameras_make_one_map(robot):
+    """Each with its own topics, camera and mount: one looks ahead, one back, and no frame is taken for another's."""
+    back, info, optical = "/back/depth/image_raw", "/back/depth/camera_info", "back_optical_frame"
+    turned = np.diag([-1.0, -1, 1, 1])
+    other, camera = rclpy.create_node("two_cameras"), replace(CAMERA, fx=30.0, fy=30.0)
+    mount = f"base_link {optical} -0.1 0 0.4 1.5707963 0 -1.5707963"
+    options = replace(robot.options, depth=(DEPTH, back), fixed=(*robot.options.fixed, mount), out="")
+    robot.mapping.close()
+    robot.mapping = Mapping(load_config(voxel_size=0.1))
+    robot.maker = MapNode(other, robot.mapping, options, str, robot.reports.append)
+    robot.send |= {back: robot.other.create_publisher(Image, back, 20)}
+    robot.send |= {info: robot.other.create_publisher(CameraInfo, info, 20)}
+    robot.until(lambda: all(one.get_subscription_count() for one in robot.send.values()))
+    made, behind = wire.messages(), np.full((CAMERA.height, CAMERA.width), 1550, np.uint16)
+    for k in range(8):
+        stamp_ns = depth_at(k).stamp_ns
+        robot.publish(info, made.camera_info(camera, stamp_ns, optical))
+        robot.publish(back, made.image(behind, stamp_ns, optical))
+    robot.drive(8)
+    robot.until(lambda: len(robot.reports) == 16)
+    assert [report.refused for report in robot.reports] == [None] * 16
+    new = Mapping(load_config(voxel_size=0.1))
+    for k in range(8):
+        ahead = depth_at(k)
+        T = base_at(ahead.stamp_ns) @ turned @ T_BASE_CAMERA
+        assert new.add(replace(ahead, sensor=DEPTH)).refused is None
+        seen = replace(ahead, depth=behind, camera=camera, T_world_sensor=T, sensor=back)
+        assert new.add(seen).refused is None
+    mine, theirs = robot.mapping.snapshot()(), new.snapshot()()
+    centres = theirs.occupied()
+    assert centres[:, 0].min() < -1.3  # what is behind
+    assert centres[:, 0].max() > 1.25  # the pole ahead
+    assert (mine.state(centres) == 3).mean() > 0.98  # mounts are told in four digits
+    robot.maker.close()
     other.destroy_node()

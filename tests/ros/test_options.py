@@ -78,6 +78,20 @@ def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
         (["--depth", DEPTH, "--correct-jumps", "--set", "dimensions=2"], "needs a map in space"),
         (["--depth", DEPTH, "--ros-args", "-p", "ros.correct_jumps:=true"], "add --set map.keep_frames=true"),
         (["--depth", DEPTH, "--poses", "track", "--load", "x.svox"], "does not know where it is"),
+        (
+            ["--lidar", "/scan", "--poses", "slam", "--set", "dimensions=2", "--load", "x.yaml"],
+            "does not know where it is",
+        ),
+        (["--depth", DEPTH, "--poses", "slam"], "give --lidar /scan"),
+        (["--depth", DEPTH, "--poses", "slm"], "did you mean 'slam'"),
+        (["--depth", DEPTH, "--lidar", "/scan"], "--lidar /scan: is for --poses slam or MAP.yaml"),
+        (["--lidar", "/scan", "--poses", "slam", "--start", "0,0,0"], "--poses MAP.yaml"),
+        (["--lidar", "/scan", "--poses", "no.yaml", "--start", "0,0"], "give X,Y,DEG"),
+        (["--lidar", "/scan", "--poses", "/no/such.yaml"], "/no/such.yaml"),
+        (["--depth", DEPTH, "--odometry", "/odom", "--reference", "/no/such.yaml"], "/no/such.yaml"),
+        (["--depth", DEPTH, "--exclude", "0,0,1,1"], "give --reference MAP.yaml"),
+        (["--lidar", "/scan", "--poses", "slam", "--reference", "x.yaml", "--exclude", "0,0,1"], "give X0,Y0,X1,Y1"),
+        (["--depth", DEPTH, "--slam-out", "x.yaml"], "add --poses slam"),
     ],
 )
 def test_mistakes_end_in_one_line(capsys, words, said):

@@ -11,7 +11,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.localize import add_start, parse_start
+from stereovox.cli.localize import add_start
 from stereovox.cli.options import add_checkpoint, overrides
 from stereovox.cli.robots import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
@@ -53,9 +53,10 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the recording, save the map and print a summary."""
-    return run_floor(
-        arguments, poses=arguments.poses, use=arguments.use, start=parse_start(arguments.start), mode=arguments.mode
-    )
+    from stereovox.localize.robot_track import parse_start
+
+    start = parse_start(arguments.start or "")
+    return run_floor(arguments, poses=arguments.poses, use=arguments.use, start=start, mode=arguments.mode)
 
 
 def run_floor(arguments: Namespace, **more: Any) -> dict[str, Any]:

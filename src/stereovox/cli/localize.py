@@ -7,7 +7,6 @@ MAP is a map_server file. Without --start the robot may be anywhere in it.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,6 @@ import numpy as np
 
 from stereovox.cli.robots import add_robot, open_noting, print_trajectory_error, settings_of
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
-from stereovox.errors import StereovoxError
 from stereovox.safe_io import check_file
 
 if TYPE_CHECKING:
@@ -46,10 +44,10 @@ def add_start(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the trajectory and print where it ends."""
     from stereovox.formats.map_server import read_map_server
-    from stereovox.localize.robot_track import check_start, fit_of, localise_robot, refused_line
+    from stereovox.localize.robot_track import check_start, fit_of, localise_robot, parse_start, refused_line
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
-    start, grid = parse_start(arguments.start), read_map_server(arguments.map)
+    start, grid = parse_start(arguments.start or ""), read_map_server(arguments.map)
     check_start(start, grid)
     robot = open_noting(arguments.source)
     say_about_compiling()
@@ -80,16 +78,3 @@ def _save(track: Track, out: Path) -> None:
         ):
             bag.pose(stamp_ns, base)
             bag.transform(stamp_ns, "map", "odom", se2.lifted(odom))
-
-
-def parse_start(text: str | None) -> np.ndarray | None:
-    """Return x, y in metres and yaw in radians of `X,Y,DEG`; raises StereovoxError for anything else."""
-    if text is None:
-        return None
-    try:
-        x, y, degrees = (float(part) for part in text.split(","))
-    except ValueError:
-        raise StereovoxError(f"--start {text}: give X,Y,DEG, for example --start=1.5,-2,90") from None
-    if not np.isfinite([x, y, degrees]).all():
-        raise StereovoxError(f"--start {text}: give finite numbers")
-    return np.array([x, y, radians(degrees)])

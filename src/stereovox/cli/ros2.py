@@ -43,8 +43,17 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     for name, value, about in topics:
         parser.add_argument(f"--{name}", action="append", metavar=value, help=f"{about}; repeatable")
-    about = "those of /tf and the options above, or of the first depth camera, by its own images (given)"
-    parser.add_argument("--poses", choices=("given", "track"), help=about)
+    about = (
+        "given: those of /tf and the options above; track: of the first depth camera, by its own images; slam, or the "
+        "MAP.yaml that the robot is localised in, by its lidar (given)"
+    )
+    parser.add_argument("--poses", metavar="HOW", help=about)
+    parser.add_argument("--lidar", metavar="TOPIC", help="laser scans that tell where the robot is (the first --scan)")
+    parser.add_argument("--start", metavar="X,Y,DEG", help="first pose of the robot in MAP.yaml: metres and degrees")
+    parser.add_argument("--slam-out", metavar="MAP", help="where to save SLAM's map at the end, for example floor.yaml")
+    parser.add_argument("--reference", metavar="MAP", help="compare the 2-D map with this .yaml (that of --poses)")
+    about = "region of the reference that does not count; repeatable"
+    parser.add_argument("--exclude", action="append", metavar="X0,Y0,X1,Y1", help=about)
     parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
     parser.add_argument("--base-frame", metavar="FRAME", help="frame of the robot (base_footprint, else base_link)")
     parser.add_argument("--corrected-path", metavar="TOPIC", help="correct the map by a SLAM program's nav_msgs/Path")
@@ -52,6 +61,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--correct-jumps", action="store_true", help="spread jumps of odom in the map over the way since the last one"
     )
+    about = "write launch file, parameters and displays for Nav2 there, and end"
+    parser.add_argument("--write-nav2", metavar="FOLDER", help=about)
+    about = "Nav2's parameters to lay ours over, with --write-nav2 (those of the sourced distribution)"
+    parser.add_argument("--nav2-params", metavar="FILE", help=about)
+    about = "start as a managed node: configure and activate it by its lifecycle services"
+    parser.add_argument("--lifecycle", action="store_true", help=about)
     parser.add_argument("--out", metavar="MAP", help="where to save the map at the end, and when the service is called")
     parser.add_argument("--load", metavar="MAP", help="continue this map")
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
@@ -69,60 +84,147 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map until Ctrl-C or SIGTERM, save the map and print a summary."""
+    if arguments.write_nav2:
+        return _write_nav2(arguments)
     from stereovox.ros.library import check_installed
 
     check_installed()
     from stereovox.ros.library import running_node
 
+    if arguments.lifecycle:
+        return _run_managed(arguments)
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
-        from stereovox.pose_choice import TRACK
-        from stereovox.ros.corrections import check_corrections
-        from stereovox.ros.mapping import Mapping
-        from stereovox.ros.options import freeze
-        from stereovox.ros.services import check_continuable
-        from stereovox.warm_up import warm_up
-
-        config, options = _settings(arguments, node)
-        options.check_sources(config.dimensions)
-        check_corrections(options, config)
-        _reserve(options.out, config.dimensions, stack)
-        say_about_compiling()
-        warm_up(config, options.poses == TRACK)
-        tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
-        mapping = Mapping(config, options.heights, tiles)
-        stack.callback(mapping.close)
-        if arguments.load:
-            check_continuable(arguments.load, options.poses == TRACK)
-            mapping.load(arguments.load)
-        freeze(node, options.out)
-        return _map(arguments, node, mapping, options)
+        return _map(_Run(arguments, node, stack))
 
 
-def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
-    from stereovox.ros.node import MapNode
-    from stereovox.ros.options import OUT
-    from stereovox.run import Checkpoints, interrupt_between_steps
+def _run_managed(arguments: Namespace) -> dict[str, Any]:
+    """Do as the node's transitions say, until it is shut down or Ctrl-C or SIGTERM."""
+    from stereovox.ros.library import running_node
+    from stereovox.ros.lifecycle import Managed, managed_node
+    from stereovox.run import interrupt_between_steps
 
-    reports: deque[UpdateReport] = deque(maxlen=MAX_REPORTS)
+    with running_node(arguments.ros_args, managed_node) as node:
+        managed = Managed(node, lambda entities: _Run(arguments, entities, ExitStack()))
+        say("unconfigured: ros2 lifecycle set /stereovox configure, then activate; Ctrl-C ends")
+        with interrupt_between_steps() as check:
+            with suppress(KeyboardInterrupt):
+                while not managed.ended:
+                    managed.spin_once()
+                    check()
+            managed.close()
+        return managed.report
 
-    def out() -> str:
-        return str(node.get_parameter(OUT).value)
 
-    map_node = MapNode(node, mapping, options, out, reports.append)
-    checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)
+class _Run:
+    """A map that is made from now on. stack: is closed when it ends, or cannot begin."""
+
+    def __init__(self, arguments: Namespace, node: Any, stack: ExitStack):
+        with stack:
+            self._begin(arguments, node, stack)
+            self._stack = stack.pop_all()
+
+    def _begin(self, arguments: Namespace, node: Any, stack: ExitStack) -> None:
+        from stereovox.ros.node import MapNode
+        from stereovox.ros.options import OUT, freeze
+        from stereovox.run import Checkpoints
+
+        self.node, self.reports = node, deque[Any](maxlen=MAX_REPORTS)
+        self.mapping, self.options = _prepare(arguments, node, stack)
+        stack.callback(freeze(node, self.options.out))
+        self.out = lambda: str(node.get_parameter(OUT).value)
+        self.map_node = MapNode(node, self.mapping, self.options, self.out, self.reports.append)
+        period_s = arguments.checkpoint if self.options.out else 0.0
+        self._checkpoints = Checkpoints(lambda: self.mapping.save(self.out()), self.options.out, period_s)
+
+    def step(self) -> None:
+        """Save the map if a checkpoint is due."""
+        _checkpoint(self._checkpoints, self.mapping.history.frames, self.node)
+
+    def end(self) -> dict[str, Any]:
+        """Map what waits, save the map and print a summary; whatever fails, the map so far is saved."""
+        with self._stack:
+            try:
+                ended = self.map_node.close()
+            except Exception:
+                self.save()
+                raise
+            result = _print_result(self.map_node, self.mapping, self.out(), self.reports)
+            return {**result, **_print_ended(ended, self.options.slam_out)}
+
+    def save(self) -> None:
+        """Save the map as it is."""
+        _save(self.mapping, self.out())
+
+
+def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping, Options]:
+    """Return the map and the options, with all kernels compiled."""
+    from stereovox.pose_choice import TRACK
+    from stereovox.ros.corrections import check_corrections
+    from stereovox.ros.mapping import Mapping
+    from stereovox.ros.options import SLAM
+    from stereovox.ros.services import check_continuable
+    from stereovox.warm_up import warm_up
+
+    config, options = _settings(arguments, node)
+    options.check_sources(config.dimensions)
+    check_corrections(options, config)
+    _reserve(options.out, config.dimensions, stack)
+    if options.slam_out:
+        _reserve(options.slam_out, 2, stack)
+    say_about_compiling()
+    warm_up(config, options.poses == TRACK)
+    tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
+    mapping = Mapping(config, options.heights, tiles)
+    stack.callback(mapping.close)
+    if arguments.load:
+        check_continuable(arguments.load, options.poses not in (TRACK, SLAM))
+        mapping.load(arguments.load)
+    return mapping, options
+
+
+def _write_nav2(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.ros.nav2 import write_nav2
+
+    paths = write_nav2(arguments.write_nav2, arguments.nav2_params)
+    say(f"written: {', '.join(str(path) for path in paths)}; start them with: ros2 launch {paths[1]}")
+    return {"written": [str(path) for path in paths]}
+
+
+def _map(run: _Run) -> dict[str, Any]:
+    from stereovox.run import interrupt_between_steps
+
     say("listening; Ctrl-C ends")
     with interrupt_between_steps() as check:
         try:
             with suppress(KeyboardInterrupt):
                 while True:
-                    map_node.spin_once()
+                    run.map_node.spin_once()
                     check()
-                    _checkpoint(checkpoints, mapping.history.frames, node)
-            map_node.close()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
+                    run.step()
         except Exception:  # whatever failed, the map so far is saved
-            _save(mapping, out())
+            run.save()
             raise
-        return _print_result(map_node, mapping, out(), reports)
+        return run.end()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
+
+
+def _print_ended(ended: dict[str, Any], slam_out: str) -> dict[str, Any]:
+    """Save SLAM's map; print what localisation, SLAM and the comparison found, and return it for JSON."""
+    from stereovox.formats.map_server import write_map_server
+
+    grid = ended.pop("slam_map", None)
+    if "localisation" in ended:
+        refused = sum(ended["localisation"]["refused"].values())
+        say(f"localised by {ended['localisation']['scans']} scans, {refused} refused")
+    if "slam" in ended:
+        say(f"SLAM: {ended['slam']['closures']} loops closed")
+    if grid is not None and slam_out:
+        write_map_server(grid, slam_out)
+        say(f"SLAM's map is saved in {slam_out}")
+    if "error" in ended:
+        eq7, coverage, contradiction = ended["error"].values()
+        parts = f"coverage {coverage:.1f}, contradiction {contradiction:.1f}"
+        say(f"error against the reference (Eq 7): {eq7:.1f} %, {parts}")
+    return ended
 
 
 def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
@@ -179,7 +281,8 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     given.settings.pop("profile", None)
     config = load_config(profile, **{**given.settings, **overrides(arguments)})
     corrections = "corrected_path", "path_frame", "correct_jumps"
-    names = *LISTS, "poses", "world_frame", "base_frame", *corrections, "out"
+    localisation = "lidar", "start", "slam_out", "reference"
+    names = *LISTS, "poses", *localisation, "world_frame", "base_frame", *corrections, "out"
     named = {name: getattr(arguments, name) for name in names}
     given_options = {name: value for name, value in named.items() if value}
     return config, with_parameters(Options(), {**given.options, **given_options})

@@ -62,6 +62,22 @@ def localise_robot(
     return localise(floor, robot.scans, config, start, progress=lambda done: progress(done, total, "localising"))
 
 
+def parse_start(text: str, name: str = "--start") -> NDArray[np.float64] | None:
+    """Return x, y in metres and yaw in radians of `X,Y,DEG`, None for ""; raises StereovoxError for anything else.
+
+    name: of the option, for messages.
+    """
+    if not text:
+        return None
+    try:
+        x, y, degrees = (float(part) for part in text.split(","))
+    except ValueError:
+        raise StereovoxError(f"{name} {text}: give X,Y,DEG, for example --start=1.5,-2,90") from None
+    if not np.isfinite([x, y, degrees]).all():
+        raise StereovoxError(f"{name} {text}: give finite numbers")
+    return np.array([x, y, np.radians(degrees)])
+
+
 def check_start(start: NDArray[np.floating] | None, floor: OccupancyGrid) -> None:
     """Raise StereovoxError for a start (x, y, yaw in radians) that is not three numbers or lies outside the map."""
     if start is None:

@@ -93,8 +93,8 @@ class Input(Protocol):
         """Return whether no later message can change the pose of a message."""
         return poses.is_final(frame_id, stamp_ns)
 
-    def frame(self, data: bytes, where: PoseLookup) -> Frame | Scan:
-        """Convert a message; the `fault` of the result says why it cannot be used."""
+    def frame(self, data: bytes, where: PoseLookup) -> Frame | Scan | None:
+        """Convert a message; the `fault` of the result says why it cannot be used. None: it is not to be mapped."""
         ...
 
 
@@ -200,7 +200,11 @@ class ScanInput(Input):
     def __init__(self, topic: str):
         self.topic = topic
 
-    def frame(self, data: bytes, where: PoseLookup) -> Scan:
+    def frame(self, data: bytes, where: PoseLookup) -> Scan | None:
+        """Convert a laser scan."""
+        return self.scan(data, where)
+
+    def scan(self, data: bytes, where: PoseLookup) -> Scan:
         """Convert a laser scan."""
         try:
             scan_message = read_laser_scan(Wire(data, cdr=True))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -16,17 +16,18 @@ REQUIRED = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msg
 
 
 @contextmanager
-def running_node(arguments: Sequence[str]) -> Iterator[Any]:
+def running_node(arguments: Sequence[str], make: Callable[..., Any] | None = None) -> Iterator[Any]:
     """Yield an rclpy node with the parameters in `arguments`, those after --ros-args.
 
-    Signal handlers stay as they are. Raises StereovoxError, one line, for arguments unknown to ROS.
+    make: makes the node, by its name and rclpy's arguments; None: a plain one. Signal handlers stay as they are. Raises
+    StereovoxError, one line, for arguments unknown to ROS.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
     try:
         rclpy.init(args=["--ros-args", *arguments], signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node(NAME, automatically_declare_parameters_from_overrides=True)
+        node = (make or rclpy.create_node)(NAME, automatically_declare_parameters_from_overrides=True)
     except Exception as error:  # rclpy's C library has many
         raise StereovoxError(f"--ros-args {' '.join(arguments)}: {error}") from None
     try:

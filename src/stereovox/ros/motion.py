@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereovox.ros.library import optional_message
 from stereovox.ros.outputs import header
+from stereovox.ros.tf_message import packed_transforms, tf_message
 from stereovox.ros.tracking import Moved
+from stereovox.se3 import Transform
 
 ODOMETRY = "tracked_odometry"
 """Topic of the odometry."""
@@ -33,15 +34,22 @@ def odometry_message(moved: Moved) -> Any:
     return message
 
 
-def transform_message(kind: Any, moved: Moved) -> Any:
-    """Return a `tf2_msgs/TFMessage`, whose class is `kind`, with the pose of the body in the world."""
-    from geometry_msgs.msg import TransformStamped
+class TransformPublisher:
+    """Publishes transforms on /tf, where `tf2_msgs` or its stand-in is there. node: rclpy's.
 
-    one = TransformStamped(header=header(moved.stamp_ns, moved.world), child_frame_id=moved.body)
-    place, turn = one.transform.translation, one.transform.rotation
-    place.x, place.y, place.z = map(float, moved.T_world_body[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = map(float, Rotation.from_matrix(moved.T_world_body[:3, :3]).as_quat())
-    return kind(transforms=[one])
+    Attributes:
+        works: Whether it does.
+    """
+
+    def __init__(self, node: Any):
+        kind = tf_message()
+        self.works = kind is not None
+        self._publisher = node.create_publisher(kind, "/tf", 100) if self.works else None
+
+    def publish(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Publish where frame `child` is in `parent`, (4, 4)."""
+        if self._publisher is not None:
+            self._publisher.publish(packed_transforms(stamp_ns, [(parent, child, T_parent_child)]))
 
 
 class MotionPublisher:
@@ -50,12 +58,10 @@ class MotionPublisher:
     def __init__(self, node: Any, with_tf: bool):
         from nav_msgs.msg import Odometry
 
-        self._node, self._tf = node, None
+        self._node = node
         self._odometry = node.create_publisher(Odometry, ODOMETRY, 10)
-        self._kind = optional_message("tf2_msgs", "TFMessage") if with_tf else None
-        if self._kind is not None:
-            self._tf = node.create_publisher(self._kind, "/tf", 100)
-        elif with_tf:
+        self._tf = TransformPublisher(node) if with_tf else None
+        if self._tf is not None and not self._tf.works:
             node.get_logger().warning(f"tf2_msgs is not installed: poses are published on {ODOMETRY} alone, not on /tf")
 
     def publish(self, moved: Moved) -> None:
@@ -70,4 +76,4 @@ class MotionPublisher:
             )
             self._node.get_logger().warning(text, throttle_duration_sec=30.0)
         else:
-            self._tf.publish(transform_message(self._kind, moved))
+            self._tf.publish(moved.stamp_ns, moved.world, moved.body, moved.T_world_body)

@@ -15,18 +15,19 @@ from typing import Any
 
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, UpdateReport
-from stereovox.pose_choice import TRACK
 from stereovox.rebuild import CorrectionReport
 from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
-from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput, header
+from stereovox.ros.inputs import header
 from stereovox.ros.mapping import Mapping
-from stereovox.ros.motion import MotionPublisher
-from stereovox.ros.options import Options, split_pair
+from stereovox.ros.obstacles import Obstacles
+from stereovox.ros.options import Options
 from stereovox.ros.outputs import Outputs
-from stereovox.ros.poses import PoseBuffer, fixed_transform
+from stereovox.ros.pose_source import pose_source
+from stereovox.ros.poses import fixed_transform
+from stereovox.ros.score import score_of
 from stereovox.ros.services import Services
 from stereovox.ros.subscriptions import Silence, Subscriptions
-from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses, Tracking
+from stereovox.se3 import inverse
 from stereovox.sources.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
@@ -37,6 +38,11 @@ MAX_AT_ONCE = 256
 
 class MapNode:
     """Maps live topics. node: rclpy's; on_report: called with the report of each frame.
+
+    Attributes:
+        waiting: Messages that wait for their pose.
+        received: Number of messages to map, by topic.
+        active: Whether frames are mapped; else they are left, and nothing is published.
 
     Raises StereovoxError, one line, for invalid options.
     """
@@ -53,17 +59,21 @@ class MapNode:
 
         self._node, self._mapping, self._on_report = node, mapping, on_report
         self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
-        self._poses, self.tracking = _poses(node, mapping, options)
+        self._executor.add_node(getattr(node, "itself", node))
+        self.active = True
+        self._source = pose_source(node, mapping.config, options)
+        self._poses = self._source.poses
         for text in options.fixed:
             parent, child, numbers = fixed_transform(text)
             self._poses.tf.add(parent, child, 0, numbers, fixed=True)
-        self._inputs = {one.topic: one for one in _inputs(options, mapping.config.dimensions, self.tracking)}
+        self._inputs = {one.topic: one for one in self._source.inputs(options, mapping.config.dimensions)}
         wait_ns, late_ns = round(1e9 * options.wait_s), round(1e9 * options.late_s)
         self.waiting: Waiting[bytes] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
         self.received: Counter[str] = Counter()
         self._outputs = Outputs(node, mapping, options, self.counts)
-        Services(node, mapping, out, self._renewed, tracked=self.tracking is not None)
+        self._obstacles = Obstacles(node, mapping, options)
+        Services(node, mapping, out, self._renewed, self._source.continuable)
+        self._score = score_of(node, mapping, options)
         self._corrector = corrector_of(node, mapping, self._poses, options)
         on_path = self._corrector.on_path if isinstance(self._corrector, PathCorrections) else None
         self._subscriptions = Subscriptions(node, options, self._poses, self._inputs, self._arrived, on_path)
@@ -80,28 +90,41 @@ class MapNode:
             "frames_in_map": history.frames,
             "refused_ever": dict(history.refused),
             "transforms_unreadable": self._poses.tf.unreadable,
-            **(self.tracking.counts() if self.tracking else {}),
+            **self._source.counts(),
             **self._corrections,
+            **(self._score.counts() if self._score else {}),
         }
 
     def spin_once(self) -> None:
         """Receive messages, map one frame, publish what is due."""
         self._receive(SOON_S if len(self.waiting) else IDLE_S)
+        if not self.active:
+            self.waiting.clear()
+            return
         arrival = self.waiting.pop(self._ready)
         if arrival is not None:
             self._map(arrival)
         if (ended := self._mapping.corrections.poll()) is not None:
             self._take(ended)
         self._outputs.update()
+        self._obstacles.update()
+        self._source.update()
+        if self._score is not None:
+            self._score.update()
         self._silence.update()
 
-    def close(self) -> None:
-        """Map all waiting frames, correct the map as was asked, and publish the final one."""
+    def close(self) -> dict[str, Any]:
+        """Map all waiting frames, correct the map as was asked, publish the final one; return figures for the report.
+
+        Keys: `localisation`, `slam`, `slam_map` (an OccupancyGrid), `error`; each where there is such a thing.
+        """
         while (arrival := self.waiting.pop(lambda one: True)) is not None:
             self._map(arrival)
         for ended in self._mapping.corrections.rest():
             self._take(ended)
         self._outputs.close()
+        error = self._score.final() if self._score is not None else {}
+        return {**self._source.finish(), **({"error": error} if error else {})}
 
     def _receive(self, wait_s: float) -> None:
         """Wait for messages and receive all that are there."""
@@ -129,6 +152,8 @@ class MapNode:
     def _map(self, one: Arrival[bytes]) -> None:
         sensor = self._inputs[one.sensor]
         frame = sensor.frame(one.content, self._poses.pose)
+        if frame is None:  # it told where the robot is, and is not to be mapped
+            return
         report = self._mapping.add(frame)
         self._on_report(report)
         if self._corrector is not None and isinstance(frame, Frame) and not frame.fault:
@@ -137,6 +162,8 @@ class MapNode:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)
         else:
             self._outputs.changed(one.stamp_ns, self._poses.world)
+            where = self._poses.pose(one.frame_id, one.stamp_ns)  # once more: where the robot is
+            self._obstacles.seen(one.stamp_ns, self._poses.world, where.T_world_sensor @ inverse(where.T_base_sensor))
 
     def _take(self, ended: Future[CorrectionReport]) -> None:
         """Publish what a correction has changed, or say why it has not."""
@@ -156,21 +183,3 @@ class MapNode:
         if self._corrector is not None:
             self._corrector.forget()
         self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")
-
-
-def _poses(node: Any, mapping: Mapping, options: Options) -> tuple[PoseBuffer, Tracking | None]:
-    """Return where poses come from, and what tracks the first depth camera, if they are tracked."""
-    names = options.world_frame, options.base_frame, options.extrapolate_s
-    if options.poses != TRACK:
-        return PoseBuffer(*names), None
-    poses = TrackedPoses(*names, base_needed=mapping.config.dimensions == 2)
-    return poses, Tracking(mapping.config, poses, MotionPublisher(node, options.publish_tf).publish)
-
-
-def _inputs(options: Options, dimensions: int, tracking: Tracking | None) -> list[Input]:
-    clouds = [FloorCloudInput(topic) if dimensions == 2 else CloudInput(topic, options.cloud_step_deg)
-              for topic in options.cloud]  # fmt: skip
-    depth = [DepthInput(*split_pair(text)) for text in options.depth]
-    if tracking is not None:
-        depth[0] = TrackedDepthInput(*split_pair(options.depth[0]), tracking)
-    return [*depth, *clouds, *map(ScanInput, options.scan)]

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.localize.robot_track import parse_start
 from stereovox.pose_choice import GIVEN, TRACK
+from stereovox.safe_io import FLOOR_READABLE
 
 PREFIX = "ros."
 """Prefix of the parameters that are options of the node."""
-LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed")
-POSES = (GIVEN, TRACK)
+LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed", "exclude")
+SLAM = "slam"
+POSES = (GIVEN, TRACK, SLAM)
 OUT = f"{PREFIX}out"
 """The parameter that may change while the node runs."""
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -33,13 +37,20 @@ class Options:
     depth: topics of depth images; `TOPIC=INFO` where the camera_info is not beside it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
-    poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images.
-    publish_tf: publish tracked poses on /tf.
+    poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images;
+    `slam`, by SLAM with the scans of `lidar`, or the `.yaml` of a map that the robot is localised in by them.
+    lidar: topic of those scans; "": the first of `scan`. start: `X,Y,DEG`, first pose of the robot in the map, metres
+    and degrees; "": anywhere. publish_tf: publish tracked poses, or where the odometry is in the map, on /tf;
+    tf_tolerance_s: seconds by which the latter is dated ahead.
+    reference: `.yaml` of a map that the 2-D map is compared with; "": that which the robot is localised in.
+    exclude: regions of it that do not count, `X0,Y0,X1,Y1` in metres. slam_out: where SLAM's map is saved; "": nowhere.
     world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected to the sensors first.
     base_frame: frame of the robot, on the floor, for floor maps; "": `base_footprint`, else `base_link`.
     wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may then be extrapolated.
     late_s: a frame that has waited this long for a busy map gives way to newer ones. queue: frames that wait per topic.
-    map_rate, cloud_rate: largest rate in messages a second: of the 2-D map, and of the cloud and the OctoMap.
+    map_rate, cloud_rate, obstacle_rate: largest rate in messages a second: of the 2-D map, of the cloud and the
+    OctoMap, and of obstacles and free rays. obstacle_range: metres round the robot in which those are; blind_m: metres
+    up to which unknown cells do not end a free ray.
     low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
     full_octomap: publish log-odds, not only occupied and free. cloud_step_deg: see `inputs.frame_of_cloud`.
     corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: whose poses they are; "":
@@ -54,7 +65,13 @@ class Options:
     pose: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     poses: str = GIVEN
+    lidar: str = ""
+    start: str = ""
+    reference: str = ""
+    exclude: tuple[str, ...] = ()
+    slam_out: str = ""
     publish_tf: bool = True
+    tf_tolerance_s: float = 0.5
     world_frame: str = ""
     base_frame: str = ""
     wait_s: float = 0.5
@@ -63,6 +80,9 @@ class Options:
     queue: int = 10
     map_rate: float = 30.0
     cloud_rate: float = 1.0
+    obstacle_rate: float = 10.0
+    obstacle_range: float = 5.0
+    blind_m: float = 1.0
     low: float = math.nan
     high: float = math.nan
     full_octomap: bool = False
@@ -75,14 +95,22 @@ class Options:
     out: str = ""
 
     def __post_init__(self) -> None:
-        if self.poses not in POSES:
-            raise StereovoxError(f"{PREFIX}poses '{self.poses}': give given or track{did_you_mean(self.poses, POSES)}")
-        for name in ("wait_s", "extrapolate_s", "late_s"):
+        if self.poses not in POSES and not self.floor:
+            known = f"give given, track, slam or the .yaml of a map{did_you_mean(self.poses, POSES)}"
+            raise StereovoxError(f"{PREFIX}poses '{self.poses}': {known}")
+        parse_start(self.start, f"{PREFIX}start")
+        for text in self.exclude:
+            region_of(text)
+        for name in ("wait_s", "extrapolate_s", "late_s", "tf_tolerance_s"):
             if not 0 <= getattr(self, name) <= 60:
                 raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give seconds, 0 to 60")
-        for name in ("map_rate", "cloud_rate"):
+        for name in ("map_rate", "cloud_rate", "obstacle_rate"):
             if not 0 < getattr(self, name) <= 1000:
                 raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give messages a second, above 0")
+        if not 0.1 <= self.obstacle_range <= 100:
+            raise StereovoxError(f"{PREFIX}obstacle_range {self.obstacle_range:g}: give metres, 0.1 to 100")
+        if not 0 <= self.blind_m <= self.obstacle_range:
+            raise StereovoxError(f"{PREFIX}blind_m {self.blind_m:g}: give metres, 0 to ros.obstacle_range")
         if not 1 <= self.queue <= 1000:
             raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
         if not 0.05 <= self.cloud_step_deg <= 10:
@@ -97,9 +125,19 @@ class Options:
         """Heights in metres between which obstacles mark the 2-D map; None: those of the settings."""
         return None if math.isnan(self.low) else (self.low, self.high)
 
+    @property
+    def floor(self) -> str:
+        """File of the map that the robot is localised in; "": none."""
+        return self.poses if Path(self.poses).suffix.lower() in FLOOR_READABLE else ""
+
+    @property
+    def localised(self) -> bool:
+        """Whether the robot is localised by its lidar."""
+        return self.poses == SLAM or bool(self.floor)
+
     def check_sources(self, dimensions: int) -> Options:
         """Return these options; raises StereovoxError for no input topic or one that this kind of map cannot use."""
-        if not (self.depth or self.cloud or self.scan):
+        if not (self.depth or self.cloud or self.scan or (self.localised and self.lidar)):
             raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
         if self.poses == TRACK and not self.depth:
             raise StereovoxError("--poses track: a depth camera is tracked; give --depth, or the poses: --poses given")
@@ -107,11 +145,35 @@ class Options:
             given = "--odometry" if self.odometry else "--pose"
             topic = (self.odometry or self.pose)[0]
             raise StereovoxError(f"{given} {topic}: is not used with --poses track; leave one of them out")
+        self._check_localisation()
         if self.scan and dimensions == 3:
             raise StereovoxError(
                 f"--scan {self.scan[0]}: a 2-D lidar maps a floor; add --set dimensions=2 or --profile ist2019"
             )
         return self
+
+    def _check_localisation(self) -> None:
+        if self.localised and not (self.lidar or self.scan):
+            raise StereovoxError(f"--poses {self.poses}: scans tell where the robot is; give --lidar /scan")
+        if self.lidar and not self.localised:
+            raise StereovoxError(f"--lidar {self.lidar}: is for --poses slam or MAP.yaml; to map scans, give --scan")
+        if self.start and not self.floor:
+            raise StereovoxError(f"--start {self.start}: says where in a map; give it as well: --poses MAP.yaml")
+        if self.slam_out and self.poses != SLAM:
+            raise StereovoxError(f"--slam-out {self.slam_out}: is SLAM's map; add --poses slam")
+        if self.exclude and not (self.reference or self.floor):
+            raise StereovoxError(f"--exclude {self.exclude[0]}: is for a comparison; give --reference MAP.yaml")
+
+
+def region_of(text: str) -> tuple[float, float, float, float]:
+    """Parse `X0,Y0,X1,Y1`, two opposite corners in metres; raises StereovoxError."""
+    try:
+        x0, y0, x1, y1 = map(float, text.split(","))
+    except ValueError:
+        x0 = y0 = x1 = y1 = math.nan
+    if not all(map(math.isfinite, (x0, y0, x1, y1))):
+        raise StereovoxError(f"{PREFIX}exclude '{text}': give X0,Y0,X1,Y1 in metres, two opposite corners")
+    return x0, y0, x1, y1
 
 
 def with_parameters(options: Options, given: Mapping[str, Any]) -> Options:
@@ -163,8 +225,8 @@ def given_parameters(node: Any) -> Given:
     return found
 
 
-def freeze(node: Any, out: str) -> None:
-    """Declare `ros.out` and refuse changes of all other parameters from now on."""
+def freeze(node: Any, out: str) -> Callable[[], None]:
+    """Declare `ros.out` and refuse changes of all other parameters, until what is returned is called."""
     from rcl_interfaces.msg import SetParametersResult
 
     if not node.has_parameter(OUT):
@@ -176,3 +238,4 @@ def freeze(node: Any, out: str) -> None:
         return SetParametersResult(successful=not fixed, reason=reason)
 
     node.add_on_set_parameters_callback(check)
+    return lambda: node.remove_on_set_parameters_callback(check)

@@ -11,6 +11,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.formats.octomap import binary_tree, full_tree
@@ -22,7 +23,6 @@ from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
 from stereovox.trust.health import Health
 
-POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("probability", "<f4")])
 FLOAT32 = 7
 """`sensor_msgs/PointField` type."""
 LEVELS = {"current": b"\0", "waiting": b"\1", "degraded": b"\1", "lost": b"\2", "stale": b"\3"}
@@ -66,18 +66,22 @@ def occupancy_message(grid: OccupancyGrid, stamp_ns: int, frame_id: str) -> Any:
 
 def cloud_message(voxel_map: VoxelMap, stamp_ns: int, frame_id: str) -> Any:
     """Return the centres of the occupied cells and their probabilities as a `sensor_msgs/PointCloud2`."""
+    centers = voxel_map.occupied()
+    return points_message(centers, stamp_ns, frame_id, probability=voxel_map.probability(centers))
+
+
+def points_message(xyz: NDArray[np.floating], stamp_ns: int, frame_id: str, **more: NDArray[np.floating]) -> Any:
+    """Return points (N, 3) in metres as a `sensor_msgs/PointCloud2` of floats. more: further fields, (N,) each."""
     from sensor_msgs.msg import PointCloud2, PointField
 
-    centers = voxel_map.occupied()
-    points = np.empty(len(centers), POINT)
-    points["x"], points["y"], points["z"] = centers.T
-    points["probability"] = voxel_map.probability(centers)
-    fields = [
-        PointField(name=name, offset=4 * n, datatype=FLOAT32, count=1) for n, name in enumerate(POINT.names or ())
-    ]
+    names = "x", "y", "z", *more
+    points = np.empty(len(xyz), [(name, "<f4") for name in names])
+    for name, values in zip(names, (*xyz.T, *more.values()), strict=True):
+        points[name] = values
+    fields = [PointField(name=name, offset=4 * n, datatype=FLOAT32, count=1) for n, name in enumerate(names)]
     return PointCloud2(
         header=header(stamp_ns, frame_id), height=1, width=len(points), fields=fields, is_bigendian=False,
-        point_step=POINT.itemsize, row_step=points.nbytes, data=array("B", points.tobytes()), is_dense=True,
+        point_step=points.itemsize, row_step=points.nbytes, data=array("B", points.tobytes()), is_dense=True,
     )  # fmt: skip
 
 
@@ -209,16 +213,16 @@ class _Publishers:
         from sensor_msgs.msg import PointCloud2
 
         self._full = options.full_octomap
-        self.map = node.create_publisher(OccupancyGrid, MAP, _latched_qos())
+        self.map = node.create_publisher(OccupancyGrid, MAP, latched_qos())
         self.status = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._cloud = self._octomap = None
         if dimensions == 3:
-            self._cloud = node.create_publisher(PointCloud2, CLOUD, _latched_qos())
+            self._cloud = node.create_publisher(PointCloud2, CLOUD, latched_qos())
             octomap = optional_message("octomap_msgs", "Octomap")
             if octomap is None:
                 node.get_logger().info("octomap_msgs is not installed: no OctoMap is published")
             else:
-                self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, _latched_qos())
+                self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, latched_qos())
 
     def has_subscribers(self) -> bool:
         """Return whether the cloud or the OctoMap has a subscriber."""
@@ -232,7 +236,7 @@ class _Publishers:
             self._octomap.publish(octomap_message(voxel_map, self._full, stamp_ns, frame_id))
 
 
-def _latched_qos() -> Any:
+def latched_qos() -> Any:
     """Return the quality of service of maps: reliable, and the last one is kept for late subscribers."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 

@@ -11,27 +11,34 @@ from stereovox.errors import StereovoxError
 from stereovox.ros.mapping import Mapping
 
 
-def check_continuable(path: str, tracked: bool) -> None:
-    """Raise StereovoxError where a map cannot be continued because poses are tracked."""
-    if tracked:
-        raise StereovoxError(f"{path}: a tracked camera does not know where it is in an older map; begin a new one")
+def check_continuable(path: str, continuable: bool) -> None:
+    """Raise StereovoxError where a map cannot be continued because each run has a frame of its own."""
+    if not continuable:
+        raise StereovoxError(
+            f"{path}: a tracked camera, or SLAM, does not know where it is in an older map; begin a new one"
+        )
 
 
 class Services:
     """`~/save` and `~/reset` (std_srvs/Trigger), `~/load` (nav_msgs/LoadMap).
 
     out: returns where to save, "": nowhere. renewed: called after another map has replaced the current one.
-    tracked: whether poses are tracked, which no saved map can be continued with. They run between two frames.
+    continuable: whether saved maps can be continued with the poses that there are. They run between two frames.
     """
 
     def __init__(
-        self, node: Any, mapping: Mapping, out: Callable[[], str], renewed: Callable[[], None], tracked: bool = False
+        self,
+        node: Any,
+        mapping: Mapping,
+        out: Callable[[], str],
+        renewed: Callable[[], None],
+        continuable: bool = True,
     ):
         from nav_msgs.srv import LoadMap
         from std_srvs.srv import Trigger
 
         self._mapping, self._out, self._renewed, self._log = mapping, out, renewed, node.get_logger()
-        self._tracked = tracked
+        self._continuable = continuable
         node.create_service(Trigger, "~/save", self._save)
         node.create_service(Trigger, "~/reset", self._reset)
         node.create_service(LoadMap, "~/load", self._load)
@@ -61,7 +68,7 @@ class Services:
             response.result = response.RESULT_MAP_DOES_NOT_EXIST
             return response
         try:
-            check_continuable(path, self._tracked)
+            check_continuable(path, self._continuable)
             self._mapping.load(path)
         except StereovoxError as error:
             self._log.error(str(error))

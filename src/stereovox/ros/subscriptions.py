@@ -15,9 +15,9 @@ from typing import Any
 from stereovox.errors import StereovoxError, one_line
 from stereovox.pose_choice import TRACK
 from stereovox.ros.inputs import DepthInput, Input
-from stereovox.ros.library import optional_message
 from stereovox.ros.options import Options, split_pair
 from stereovox.ros.poses import PoseBuffer
+from stereovox.ros.tf_message import tf_message
 
 FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""
@@ -98,7 +98,7 @@ class Subscriptions:
         self._listen_to_tf(where, options)
 
     def _listen_to_tf(self, where: PoseBuffer, options: Options) -> None:
-        kind = optional_message("tf2_msgs", "TFMessage")
+        kind = tf_message()
         tracked = options.poses == TRACK
         if kind is None and not (tracked or options.odometry or options.pose or options.fixed):
             raise StereovoxError(

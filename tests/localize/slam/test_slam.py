@@ -13,7 +13,7 @@ from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
 from stereovox.evaluate.trajectory import read_relations, relation_errors
-from stereovox.localize.slam.pipeline import SCANS_PER_KEYFRAME, Slam, map_scans
+from stereovox.localize.slam.pipeline import SCANS_PER_KEYFRAME, KeyframeMap, Slam, map_scans
 from stereovox.mapper import GridMapper
 from stereovox.maps import State
 from stereovox.sources.robots.carmen import CarmenLog
@@ -230,3 +230,16 @@ def test_a_robot_that_stands_still_has_a_map_too(loop):
     states = map_scans(still, load_config()).grid.states
     assert (states == State.FREE).sum() > 100
     assert (states == State.OCCUPIED).sum() > 20
+
+
+def test_the_map_on_the_way_is_that_of_all_keyframes_whether_they_moved_or_not(loop):
+    _, _, _, result = loop
+    keyframes, config = result.keyframes[:60], load_config()
+    growing = KeyframeMap(config)
+    growing.grid(keyframes[:30])
+    grown, whole = growing.grid(keyframes), KeyframeMap(config).grid(keyframes)
+    np.testing.assert_array_equal(grown.cells, whole.cells)
+    moved = [replace(one, pose=se2.compose([0.4, 0.0, 0.1], one.pose)) for one in keyframes]
+    bent, anew = growing.grid(moved), KeyframeMap(config).grid(moved)
+    np.testing.assert_array_equal(bent.cells, anew.cells)
+    assert bent.cells.shape != grown.cells.shape or (bent.cells != grown.cells).any()

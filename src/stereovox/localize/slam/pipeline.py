@@ -70,6 +70,11 @@ class Slam:
         self._follower = Follower(config.slam)
         self._loops = LoopFinder(config.slam, self._follower.keyframes)
         self._builder = TrackBuilder()
+        self._map = KeyframeMap(config)
+
+    def grid(self) -> OccupancyGrid | None:
+        """Return the map as known so far; None before the first keyframe. Later loops may change all of it."""
+        return self._map.grid(self.keyframes) if self.keyframes else None
 
     @property
     def pose(self) -> se2.Pose:
@@ -118,7 +123,9 @@ class Slam:
             self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_WEIGHT)
         track = self._builder.track(self.keyframes)
         doubts = doubts_of(self.keyframes, self._loops.edges)
-        return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused, doubts)
+        return SlamResult(
+            track, self._map.grid(self.keyframes), self.keyframes, self._loops.edges, self.refused, doubts
+        )
 
     def _refuse(self, reason: str, count: int = 1) -> None:
         if count:
@@ -137,17 +144,30 @@ class Slam:
     def _poses(self) -> NDArray[np.float64]:
         return np.array([keyframe.pose for keyframe in self.keyframes])
 
-    def _grid(self) -> OccupancyGrid:
-        settings = self._config.slam
-        evidence = {f"grid.{name}": _repeated(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
-        config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range, **evidence)
-        _check_extent(self._poses(), settings.voxel_size)
-        grid, beams = GridMap(config), make_beams(config)
-        for scan in map(in_map, self.keyframes):
-            if not settings.clear_far:
+
+class KeyframeMap:
+    """The floor map of keyframes. New ones are added to it; it is made anew once earlier ones have moved."""
+
+    def __init__(self, config: Config):
+        self._settings = config.slam
+        evidence = {f"grid.{name}": _repeated(getattr(config.grid, name)) for name in ("p_occupied", "p_free")}
+        size, reach = self._settings.voxel_size, self._settings.max_range
+        self._config = load_config(config, voxel_size=size, max_range=reach, **evidence)
+        self._beams = make_beams(self._config)
+        self._map, self._drawn = GridMap(self._config), np.empty((0, 3))
+
+    def grid(self, keyframes: list[Keyframe]) -> OccupancyGrid:
+        """Return the map of all keyframes at their poses as of now. Raises StereovoxError where it is too wide."""
+        poses, drawn = np.array([keyframe.pose for keyframe in keyframes]), len(self._drawn)
+        _check_extent(poses, self._settings.voxel_size)
+        if not np.array_equal(poses[:drawn], self._drawn):
+            self._map, drawn = GridMap(self._config), 0
+        for scan in map(in_map, keyframes[drawn:]):
+            if not self._settings.clear_far:
                 scan = replace(scan, ranges=np.where(np.isposinf(scan.ranges), np.float32(np.nan), scan.ranges))
-            grid.add(beams.evidence(scan, grid.origin))
-        return grid.occupancy()
+            self._map.add(self._beams.evidence(scan, self._map.origin))
+        self._drawn = poses
+        return self._map.occupancy()
 
 
 @dataclass(frozen=True, eq=False)

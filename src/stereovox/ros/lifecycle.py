@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node as a managed one (ROS 2's lifecycle): configure, activate, deactivate, cleanup, shutdown.
+
+Unconfigured it has no topics. Configured it has them, and knows poses, but maps nothing until it is active. At cleanup
+the map is saved and everything is taken away; the next configuration reads the parameters anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+from stereovox.errors import StereovoxError
+from stereovox.ros.node import MapNode
+
+IDLE_S = 0.1
+CREATE = {
+    "create_publisher": "destroy_publisher",
+    "create_subscription": "destroy_subscription",
+    "create_service": "destroy_service",
+}
+"""What makes an entity of a node, and what destroys it."""
+
+
+class Entities:
+    """Stands for a node while something is made, and destroys all that was made."""
+
+    def __init__(self, node: Any):
+        self._node = node
+        self._made: list[tuple[str, Any]] = []
+
+    @property
+    def itself(self) -> Any:
+        """The node."""
+        return self._node
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(self._create, name) if name in CREATE else getattr(self._node, name)
+
+    def destroy(self) -> None:
+        """Destroy all publishers, subscriptions and services that were made."""
+        while self._made:
+            name, one = self._made.pop()
+            getattr(self._node, CREATE[name])(one)
+
+    def _create(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        made = getattr(self._node, name)(*args, **kwargs)
+        self._made.append((name, made))
+        return made
+
+
+class Run(Protocol):
+    """A map that is made between configuration and cleanup.
+
+    Attributes:
+        map_node: What makes it.
+    """
+
+    map_node: MapNode
+
+    def step(self) -> None:
+        """Do what is due beside mapping, such as saving it."""
+
+    def end(self) -> dict[str, Any]:
+        """Map what waits, save the map, release everything; return figures for the report."""
+        ...
+
+
+class Managed:
+    """Holds at most one `Run`, as the node's state says.
+
+    begin: called at configuration with what stands for the node; may raise StereovoxError, and then it failed.
+
+    Attributes:
+        ended: Whether the node was shut down by its transition.
+        report: Figures of the last run that ended.
+    """
+
+    def __init__(self, node: Any, begin: Callable[[Any], Run]):
+        from rclpy.executors import SingleThreadedExecutor
+
+        self._node, self._begin = node, begin
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._entities, self._run = Entities(node), None
+        self._over, self.ended, self.report = False, False, dict[str, Any]()
+        node.managed = self
+
+    def spin_once(self) -> None:
+        """Receive messages and calls, and map one frame where the node is active."""
+        if self._run is None:
+            self._executor.spin_once(timeout_sec=IDLE_S)
+            return
+        self._run.map_node.spin_once()
+        self._run.step()
+        if self._over:  # not in the callback: topics would vanish while their messages are received
+            self.close()
+
+    def close(self) -> None:
+        """End the run, if any, and take away its topics."""
+        run, self._run, self._over = self._run, None, False
+        if run is not None:
+            try:
+                self.report = run.end()
+            finally:
+                self._entities.destroy()
+                self._executor.add_node(self._node)
+
+    def configure(self) -> bool:
+        """Make the topics and an empty map; return whether that was possible."""
+        try:
+            self._run = self._begin(self._entities)
+        except Exception as error:  # rclpy would swallow it
+            self._entities.destroy()
+            self._executor.add_node(self._node)
+            why = str(error) if isinstance(error, StereovoxError) else repr(error)
+            self._node.get_logger().error(f"not configured: {why}")
+            return False
+        self._run.map_node.active = False
+        return True
+
+    def activate(self, active: bool) -> None:
+        """Map from now on, or no longer."""
+        if self._run is not None:
+            self._run.map_node.active = active
+
+    def cleanup(self) -> None:
+        """End the run soon."""
+        self._over = self._run is not None
+
+    def shut_down(self) -> None:
+        """End the run soon, and then the process."""
+        self.cleanup()
+        self.ended = True
+
+
+def managed_node(name: str, **kwargs: Any) -> Any:
+    """Return an unconfigured `rclpy.lifecycle.LifecycleNode` whose transitions go to the `Managed` that takes it."""
+    from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+    done, failed = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+    class Node(LifecycleNode):
+        managed: Managed
+
+        def on_configure(self, state: Any) -> Any:
+            return done if self.managed.configure() else failed
+
+        def on_activate(self, state: Any) -> Any:
+            self.managed.activate(True)
+            return done
+
+        def on_deactivate(self, state: Any) -> Any:
+            self.managed.activate(False)
+            return done
+
+        def on_cleanup(self, state: Any) -> Any:
+            self.managed.cleanup()
+            return done
+
+        def on_shutdown(self, state: Any) -> Any:
+            self.managed.shut_down()
+            return done
+
+    return Node(name, **kwargs)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a local planner needs of the map: obstacles round the robot, and how far it is free, as Nav2's costmaps take it.
+
+A costmap keeps what was once marked until a ray of a clearing source sweeps over it, and it takes no other word for it
+that something is gone. So there are two clouds of one time: `obstacles` to mark, and `free_rays`, the last free cells
+in all directions, to clear up to. Both come from the map, which has weighed all that was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import se2
+from stereovox.errors import StereovoxError
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.maps.voxel_map import State
+from stereovox.ros.mapping import Mapping
+from stereovox.ros.options import Options
+from stereovox.ros.outputs import points_message
+from stereovox.se3 import Transform
+
+OBSTACLES, FREE_RAYS = "obstacles", "free_rays"
+"""Topics."""
+STEP = 0.5
+"""Cells from one place on a ray to the next."""
+
+
+def obstacle_points(grid: OccupancyGrid, place: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """Return the centres (N, 2) of occupied cells within `reach` metres of a place (2,), in the map's frame."""
+    rows, columns = np.nonzero(grid.states == State.OCCUPIED)
+    points = grid.centres(rows, columns)
+    return points[np.linalg.norm(points - place, axis=1) <= reach]
+
+
+def free_ends(grid: OccupancyGrid, place: NDArray[np.float64], reach: float, blind: float) -> NDArray[np.float64]:
+    """Return how far it is free round a place (2,): the last free cell's centre (N, 2) in each direction that has any.
+
+    A ray ends before the first cell that is not free. Unknown cells up to `blind` metres do not end it, since a camera
+    does not see what is at its feet; others do: they may be anything. Rays are one cell apart at `reach` metres.
+    """
+    fan, distances = _fan(round(reach / grid.resolution))
+    at = se2.transform(se2.inverse(grid.origin), place[None])[0] / grid.resolution  # in cells: column, row
+    corner, states = _window(grid, at, len(distances))
+    columns, rows = ((at[axis] - corner[axis] + fan[axis]).astype(np.int32) for axis in (0, 1))
+    found = states.ravel()[rows * np.int32(states.shape[1]) + columns]
+    free = found == State.FREE
+    passes = free | ((found == State.UNKNOWN) & (distances <= blind / grid.resolution))
+    open_to = np.logical_and.accumulate(passes, axis=1) & free
+    rays = np.flatnonzero(open_to.any(axis=1))
+    last = open_to.shape[1] - 1 - np.argmax(open_to[rays, ::-1], axis=1)
+    return grid.centres(rows[rays, last] + corner[1], columns[rays, last] + corner[0])
+
+
+@lru_cache(maxsize=4)
+def _fan(reach: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return places on rays in all directions, (2, rays, steps) x and y in cells, and their distances (steps,)."""
+    distances = np.arange(STEP, reach, STEP, dtype=np.float32)
+    angles = np.arange(0.0, 2 * np.pi, 1 / reach)
+    ways = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+    return ways[:, :, None] * distances, distances
+
+
+def _window(grid: OccupancyGrid, at: NDArray[np.float64], steps: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return the states of all cells that rays may reach, unknown outside of the picture, and column and row of the
+    first."""
+    half = int(np.ceil(steps * STEP)) + 2
+    corner, (rows, columns) = np.floor(at).astype(np.int64) - half, grid.cells.shape
+    cells = np.full((2 * half + 1, 2 * half + 1), UNKNOWN, np.int8)
+    (left, bottom), (right, top) = np.maximum(corner, 0), np.minimum(corner + 2 * half + 1, (columns, rows))
+    if left < right and bottom < top:
+        x, y = corner
+        cells[bottom - y : top - y, left - x : right - x] = grid.cells[bottom:top, left:right]
+    return corner, replace(grid, cells=cells).states
+
+
+class Obstacles:
+    """Publishes both clouds while frames come that can be trusted; with the stamp of the newest one.
+
+    Without such frames nothing is published, so that who needs to know that the map is current can tell by the stamps.
+    clock: monotonic seconds.
+    """
+
+    def __init__(self, node: Any, mapping: Mapping, options: Options, clock: Callable[[], float] = monotonic):
+        from sensor_msgs.msg import PointCloud2
+
+        self._node, self._mapping, self._options, self._clock = node, mapping, options, clock
+        self._publishers = [node.create_publisher(PointCloud2, topic, 1) for topic in (OBSTACLES, FREE_RAYS)]
+        self._newest: tuple[int, str, NDArray[np.float64]] | None = None
+        self._next = 0.0
+        self._height = sum(options.heights or mapping.config.scan.heights) / 2
+
+    def seen(self, stamp_ns: int, world: str, T_world_base: Transform) -> None:
+        """Take in that a frame was mapped, and where the robot was."""
+        self._newest = stamp_ns, world, T_world_base[:2, 3]
+
+    def update(self) -> None:
+        """Publish what is due."""
+        now = self._clock()
+        if self._newest is None or now < self._next:
+            return
+        if not any(one.get_subscription_count() for one in self._publishers):
+            return
+        self._next = now + 1 / self._options.obstacle_rate
+        (stamp_ns, world, place), self._newest = self._newest, None
+        try:
+            grid = self._mapping.grid()
+        except StereovoxError as error:
+            self._node.get_logger().error(f"no obstacles: {error}", throttle_duration_sec=10.0)
+            return
+        if grid is None:
+            return
+        reach = self._options.obstacle_range
+        clouds = obstacle_points(grid, place, reach), free_ends(grid, place, reach, self._options.blind_m)
+        for publisher, points in zip(self._publishers, clouds, strict=True):
+            lifted = np.column_stack([points, np.full(len(points), self._height)])
+            publisher.publish(points_message(lifted, stamp_ns, world))

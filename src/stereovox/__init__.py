@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from stereovox.joining import Joined as Joined
     from stereovox.joining import join as join
     from stereovox.joining import merge as merge
+    from stereovox.lab.flights.campaign import explore as explore
+    from stereovox.lab.flights.explore import Cruise as Cruise
     from stereovox.live.rig import LiveCamera as LiveCamera
     from stereovox.live.run import LiveResult as LiveResult
     from stereovox.live.run import LiveRun as LiveRun
@@ -159,6 +161,8 @@ _HOMES = {
     "surface": "formats.meshes",
     "FloorRun": "floor_run",
     "map_floor": "floor_run",
+    "Cruise": "lab.flights.explore",
+    "explore": "lab.flights.campaign",
     "write_nav2": "ros.nav2",
     "MapResult": "run",
     "MapRun": "run",

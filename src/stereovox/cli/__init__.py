@@ -47,6 +47,7 @@ COMMANDS = (
     "localize",
     "track",
     "simulate",
+    "explore",
     "ros2",
     "bench",
     "benchmark",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.lab.flights.explore import Air, Cruise, Frontiers, MiddleOfRoom, explore
+from stereovox.lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, explore
 from stereovox.lab.flights.flight import World
 
 SHORT = Cruise(seconds=35.0)
@@ -61,8 +61,10 @@ def test_ways_that_are_not_free_are_not_flown(world):
     assert explored.clearance_m > SHORT.airframe.radius
 
 
-def test_air_is_what_touches_nothing(world):
-    air = Air(world, 0.1)
-    inside = [solid for solid in world.camera.scene.solids if solid.part == "boxes"]
-    assert len(air._air) > 50_000
-    assert not any(solid.contains(air._air).any() for solid in inside)
+def test_without_the_check_ahead_it_collides_and_that_is_told(world):
+    """The control of the test above: a vehicle that takes all before it for its own place flies on."""
+    explored = explore(3, Through(), replace(SHORT, seconds=60.0, own_radius=50.0, camera_hz=2.0), world)
+    assert explored.collided_s is not None
+    assert explored.seconds == explored.collided_s
+    assert explored.clearance_m < SHORT.airframe.radius
+    assert not explored.done

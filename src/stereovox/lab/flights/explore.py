@@ -15,10 +15,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.lab.flights.air import Air
 from stereovox.lab.flights.flight import STEP_S, World
 from stereovox.mapper import Mapper
-from stereovox.maps import State, VoxelMap
-from stereovox.products.frontiers import frontiers
+from stereovox.maps import VoxelMap
+from stereovox.products.frontiers import Frontier, frontiers
 from stereovox.products.level_ways import LevelWays
 from stereovox.products.path_check import check_path, point_along
 from stereovox.se3 import Transform
@@ -32,6 +33,9 @@ CHECK_M, CHECK_S = 1.0, 0.2
 """Metres of the way that are checked, and how often."""
 FACING = 0.5
 """It flies once it looks along its way to within so many radians."""
+NEAR_M, SHORT_M = 0.5, 2.0
+"""A way leads to within NEAR_M of where a frontier is seen from; where none does, one that ends SHORT_M short brings
+the vehicle nearer, and it looks from there."""
 SEEN_AGAIN = 0.6
 """A frontier within so many metres of one that was looked at brings nothing."""
 
@@ -110,17 +114,24 @@ class Frontiers:
         found = frontiers(
             voxel_map, self._smallest, heights=(height - self._band, height + self._band), start=ways.start, radius=0.2
         )
-        best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        for one in found:
-            if one.look_from is None or any(
-                np.linalg.norm(one.centroid - done) < SEEN_AGAIN for done in self._looked_at
-            ):
-                continue
-            way = ways.way_to(one.look_from, near=0.5)
-            if way is not None and (best is None or _length(way) < _length(best[0])):
-                best = way, one.centroid
+        new = [one for one in found if one.look_from is not None and not self._seen(one.centroid)]
+        best = self._nearest(new, ways, NEAR_M) or self._nearest(new, ways, SHORT_M)
         if best is not None:
             self._looked_at.append(best[1])
+        return best
+
+    def _seen(self, place: NDArray[np.float64]) -> bool:
+        return any(np.linalg.norm(place - done) < SEEN_AGAIN for done in self._looked_at)
+
+    def _nearest(
+        self, found: list[Frontier], ways: LevelWays, near: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the shortest way to `near` metres from where one of the frontiers is seen from, and its middle."""
+        best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        for one in found:
+            way = None if one.look_from is None else ways.way_to(one.look_from, near)
+            if way is not None and (best is None or _length(way) < _length(best[0])):
+                best = way, one.centroid
         return best
 
 
@@ -136,8 +147,11 @@ class Explored:
         metres: How far it flew.
         goals: How many ways it flew, or began to.
         clearance_m: Least distance between its middle and a surface.
-        coverage: (seconds, share of the hall's air that is known to be free) every ten seconds.
+        coverage: (seconds, share of the scene's air that is known to be free) every ten seconds.
         place: (3,) metres, where it ended.
+        path: (3,) metres every second, where it flew.
+        room_m: Horizontal metres about the place where it ended that touch nothing, `half_height` above and below.
+        most_room_m: The most of that there is anywhere in the scene's air at its height.
     """
 
     seed: int
@@ -149,6 +163,9 @@ class Explored:
     clearance_m: float
     coverage: list[tuple[float, float]]
     place: list[float]
+    path: list[list[float]]
+    room_m: float
+    most_room_m: float
 
     def as_dict(self) -> dict[str, Any]:
         """Return all values as plain types for JSON."""
@@ -167,8 +184,16 @@ def explore(seed: int, mission: Mission, cruise: Cruise | None = None, world: Wo
     Returns:
         What became of it.
     """
+    return fly(seed, mission, cruise, world)[0]
+
+
+def fly(
+    seed: int, mission: Mission, cruise: Cruise | None = None, world: World | None = None
+) -> tuple[Explored, VoxelMap]:
+    """Return what `explore` does, and the map that was made."""
     cruise = cruise or Cruise()
-    return _Mission(seed, mission, cruise, world or World(cruise.scene.format(seed=seed))).run()
+    flown = _Mission(seed, mission, cruise, world or World(cruise.scene.format(seed=seed)))
+    return flown.run(), flown.map
 
 
 class _Mission:
@@ -181,7 +206,7 @@ class _Mission:
         self._quad = Quadrotor(place, draw.uniform(-np.pi, np.pi), cruise.airframe)
         self._height = float(place[2])
         self._mapper = Mapper("default", voxel_size=cruise.voxel_size)
-        self._air = Air(world, cruise.voxel_size)
+        self._air = Air(world.camera.scene, cruise.voxel_size, place)
         self._under_way: deque[tuple[float, Transform]] = deque()
         self._images = self._goals = 0
         self._way: NDArray[np.float64] | None = None
@@ -189,14 +214,22 @@ class _Mission:
         self._look_left = 2 * np.pi
         self._checked = 0.0
 
+    @property
+    def map(self) -> VoxelMap:
+        """The map so far."""
+        return self._mapper.map
+
     def run(self) -> Explored:
         """Fly until the mission is done, time is up, or a collision."""
         metres, least, collided, done, coverage, now = 0.0, inf, None, False, [], 0.0
+        path: list[list[float]] = []
         for step in range(round(self._cruise.seconds / STEP_S)):
             now = step * STEP_S
             self._see(now)
             if not step % round(10 / STEP_S):
                 coverage.append((now, self._air.known(self._mapper.map)))
+            if not step % round(1 / STEP_S):
+                path.append(self._quad.position.round(3).tolist())
             if self._way is None and self._look_left <= 0 and not self._choose():
                 done = True
                 break
@@ -209,8 +242,10 @@ class _Mission:
                 collided = now
                 break
         coverage.append((now, self._air.known(self._mapper.map)))
-        place = self._quad.position.tolist()
-        return Explored(self._seed, collided, now, done, metres, self._goals, least, coverage, place)
+        place = self._quad.position
+        room_m, most_m = self._air.room(place, self._cruise.half_height)
+        course = (metres, self._goals, least, coverage, place.tolist(), path, room_m, most_m)
+        return Explored(self._seed, collided, now, done, *course)
 
     def _see(self, now: float) -> None:
         """Take an image where one is due, and put those into the map that were taken long enough ago."""
@@ -274,27 +309,6 @@ class _Mission:
             return True
         places = [point_along(self._way, metres) for metres in np.linspace(start, end, 6)]
         return check_path(self._mapper.map, places, cruise.airframe.radius).free
-
-
-class Air:
-    """The cells of a hall that touch nothing."""
-
-    def __init__(self, world: World, cell: float):
-        scene = world.camera.scene
-        walls = [solid.bounds for solid in scene.part("walls")]
-        low = np.array([walls[0][1, 0], walls[2][1, 1], scene.part("floor")[0].bounds[1, 2]])
-        high = np.array([walls[1][0, 0], walls[3][0, 1], scene.part("ceiling")[0].bounds[0, 2]])
-        first, last = np.ceil(low / cell).astype(int), np.floor(high / cell).astype(int)
-        centres = (np.indices(tuple(last - first)).reshape(3, -1).T + first + 0.5) * cell
-        inside = [solid for solid in scene.solids if solid.part not in ("walls", "floor", "ceiling")]
-        touched = np.zeros(len(centres), bool)
-        for solid in inside:
-            touched |= solid.contains(centres, 0.6 * cell)
-        self._air = centres[~touched]
-
-    def known(self, voxel_map: VoxelMap) -> float:
-        """Return the share of the air that the map knows to be free."""
-        return float((voxel_map.state(self._air) == State.FREE).mean())
 
 
 def _length(way: NDArray[np.float64]) -> float:

@@ -6,7 +6,8 @@
 Each seed is another hall and start. One depth camera (10 Hz, a D435's field of view, 212 pixels wide) looks ahead; the
 vehicle flies at one height at up to 0.6 m/s, by ways on which a ball of 35 cm touches only what is known to be free.
 Told: collisions (a ball of 25 cm touches a surface), the share of the hall's air that is known to be free over time,
-and how far it flew. `middle`: how far the place is from the middle of the hall's largest free circle.
+and how far it flew. `room_m`: from where it ends to the nearest thing but floor and ceiling; `best_room_m`: the most
+that there is anywhere in the hall at that height, which may be out of sight.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import numpy as np
 
 from stereovox.lab.flights.explore import Cruise, Explored, Frontiers, MiddleOfRoom, explore
 from stereovox.lab.flights.flight import World
+from stereovox.simulate.clearance import Clearance
+from stereovox.simulate.scene import Scene
 
 TIMES = (10, 30, 60, 90, 120, 180, 240, 300)
 
@@ -50,7 +53,19 @@ def one(seed: int, mission: str, cruise: Cruise) -> dict[str, Any]:
     middle = MiddleOfRoom()
     explored = explore(seed, Frontiers() if mission == "frontiers" else middle, cruise, world)
     row = {**explored.as_dict(), "coverage": {str(t): round(at(explored, t), 3) for t in TIMES}}
-    return {**row, "room_m": round(world.clearance.at(np.array(explored.place)), 3)}
+    room, best = rooms(world, np.array(explored.place))
+    return {**row, "room_m": round(room, 3), "best_room_m": round(best, 3)}
+
+
+def rooms(world: World, place: np.ndarray) -> tuple[float, float]:
+    """Return the room about a place, and the most there is at its height on a grid of 25 cm, level."""
+    scene = world.camera.scene
+    upright = Clearance(Scene([solid for solid in scene.solids if solid.part not in ("floor", "ceiling")]))
+    walls = np.concatenate([solid.bounds for solid in scene.part("walls")])
+    x, y = (np.arange(walls[:, k].min() + 0.5, walls[:, k].max() - 0.5, 0.25) for k in (0, 1))
+    grid = np.array([[a, b, place[2]] for a in x for b in y])
+    free = ~np.any([solid.contains(grid) for solid in scene.solids], axis=0)
+    return upright.at(place), max(upright.at(point) for point in grid[free])
 
 
 def at(explored: Explored, seconds: float) -> float:
@@ -68,7 +83,9 @@ def told(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "metres": {"sum": round(sum(r["metres"] for r in rows), 1), "least": round(min(r["metres"] for r in rows), 2)},
         "goals": sum(row["goals"] for row in rows),
         "clearance_least_m": round(min(row["clearance_m"] for row in rows), 3),
-        "room_at_the_end_m_median": float(np.median([row["room_m"] for row in rows])),
+        "room_m_median": float(np.median([row["room_m"] for row in rows])),
+        "best_room_m_median": float(np.median([row["best_room_m"] for row in rows])),
+        "room_share_median": round(float(np.median([row["room_m"] / row["best_room_m"] for row in rows])), 3),
         "coverage_median": {str(t): float(np.median([row["coverage"][str(t)] for row in rows])) for t in TIMES},
         "coverage_least_at_the_end": min(row["coverage"][str(TIMES[-1])] for row in rows),
     }

@@ -124,8 +124,7 @@ def test_the_sensor_that_is_silent_longest_counts(start_autopilot, frames):
         clock.ns += 600_000_000
         newer = replace(frames[1], sensor="left")
         sender.after(newer, mapper.add(newer))
-        while not told:
-            autopilot.wait_for("HEARTBEAT")
+        autopilot.wait_for("HEARTBEAT", number=3)
     assert "frame of right is 0.60 s old" in told[0]
 
 

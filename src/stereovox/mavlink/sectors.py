@@ -52,7 +52,8 @@ class SectorRules:
 
     Attributes:
         max_distance: Horizontal metres up to which cells are looked at, at most 655.
-        half_height: Metres above and below the body's origin within which cells count.
+        half_height: Metres above and below the body's origin within which cells count; more than the vehicle reaches,
+            roll and pitch included.
         overlap_deg: Degrees by which each sector reaches into its neighbours on either side, 0 to 45.
         own_radius: Horizontal metres about the body within which unknown and tentative cells are taken for the
             vehicle's own place. A camera does not see them before take-off; later none comes as near without being

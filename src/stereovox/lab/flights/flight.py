@@ -45,6 +45,7 @@ class Setup:
         camera_hz: Images a second.
         delay_s: From the image to the map.
         rate_hz: OBSTACLE_DISTANCE messages a second.
+        max_age_s: Seconds since the last frame that the map took in after which none is sent.
         pose_sigma: Standard deviations of the error of each pose on its own: metres, radians.
         rules: Of the sectors.
         parameters: The autopilot's.
@@ -59,6 +60,7 @@ class Setup:
     camera_hz: float = 15.0
     delay_s: float = 0.06
     rate_hz: float = 10.0
+    max_age_s: float = 0.5
     pose_sigma: tuple[float, float] = (0.0, 0.0)
     rules: SectorRules = field(default_factory=lambda: SectorRules(own_radius=0.75))
     parameters: Parameters = field(default_factory=Parameters)
@@ -176,6 +178,7 @@ class _Loop:
         self._autopilot = CollisionPrevention(setup.parameters)
         self._under_way: deque[tuple[float, int, Transform]] = deque()
         self._pose: Transform | None = None
+        self._accepted = -inf
         self._frames = self._refused = 0
         self._metres = self._asked = self._top = 0.0
         self._least = inf
@@ -210,7 +213,7 @@ class _Loop:
                 T, self._seed * 1_000_000 + number, round(1e9 * taken), self._reported(T)
             )
             if self._mapper.add(frame).refused is None:
-                self._frames, self._pose = self._frames + 1, frame.T_world_sensor
+                self._frames, self._pose, self._accepted = self._frames + 1, frame.T_world_sensor, now
             else:
                 self._refused += 1
 
@@ -222,8 +225,8 @@ class _Loop:
         return wrong
 
     def _tell(self, now: float) -> None:
-        """Send sectors as `ObstacleSender` does: of the pose of the last frame."""
-        if self._pose is not None:
+        """Send sectors as `ObstacleSender` does: of the pose of the last frame, and none once that is too old."""
+        if self._pose is not None and now - self._accepted <= self._setup.max_age_s:
             rules = self._setup.rules
             cm = obstacle_sectors(self._mapper.map, self._pose, rules).centimetres(rules)
             self._autopilot.receive(cm, rules.max_cm, now)

@@ -172,7 +172,7 @@ def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping
     if options.slam_out:
         _reserve(options.slam_out, 2, stack)
     say_about_compiling()
-    warm_up(config, options.poses == TRACK)
+    warm_up(config, options.poses == TRACK, options.localised)
     tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
     mapping = Mapping(config, options.heights, tiles)
     stack.callback(mapping.close)

@@ -12,7 +12,7 @@ CODE = """
 import sys
 from numba.core.registry import CPUDispatcher
 from stereovox.config import load_config
-from stereovox.ros.warm_up import warm_up
+from stereovox.warm_up import warm_up
 from stereovox.ros.localization import {kind}
 from stereovox.simulate.floors.floor import Floor
 

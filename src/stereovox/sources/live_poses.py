@@ -37,8 +37,8 @@ class LivePoses:
 
     Args:
         where: What they come from, for messages.
-        max_speed_mps, max_turn_dps: Poses further apart than these speeds allow are a jump, in metres and degrees a
-            second.
+        max_speed_mps: Poses further apart than this speed allows are a jump, in metres a second.
+        max_turn_dps: The same in degrees a second.
         clock: Monotonic seconds, for waiting.
 
     Attributes:

@@ -100,8 +100,10 @@ def test_rays_without_a_surface_are_free_to_their_end_and_no_further():
     T = np.eye(4)
     T[:3, 3] = 0.05
     cloud = CheckedCloud(np.array([[2.0, 0.0, 0.0]]), None, np.zeros(1, bool), Lidar(0.02), T)
-    found = cells_of(Points(load_config(voxel_size=0.1, max_range=3.0)).evidence(cloud))
-    assert set(found) == {(k, 0, 0) for k in range(21)}
+    config = load_config(voxel_size=0.1, max_range=3.0)
+    found = cells_of(Points(config).evidence(cloud))
+    middles = {k: 0.1 * k if k else 0.025 for k in range(20)} | {20: 1.975}  # metres from the sensor, on the ray
+    assert set(found) == {(k, 0, 0) for k, middle in middles.items() if middle > config.blind + 1e-6}
     assert max(found.values()) < 0
 
 
@@ -114,10 +116,10 @@ def test_a_point_beyond_the_maximum_range_frees_what_its_noise_allows():
     assert max(x for x, _, _ in found) == 23  # 3.1 - 4 * 0.2, from 0.05
 
 
-def test_more_cells_than_can_be_counted_are_refused():
-    cloud = made_cloud(7)
+def test_more_cells_than_can_be_counted_are_refused(monkeypatch):
+    monkeypatch.setattr("stereovox.integrate.points.MAX_BLOCKS", 8192)
     with pytest.raises(FrameRefused, match="lower max_range"):
-        Points(load_config(voxel_size=0.001, max_range=1000.0)).evidence(cloud)
+        Points(load_config(voxel_size=0.01, max_range=4.0)).evidence(made_cloud(7, count=2000))
 
 
 def test_graphics_cards_take_no_clouds(monkeypatch):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereovox import Mapper, MapRun, ObstacleSender, StereovoxError, open_source
+from stereovox import Cloud, Mapper, MapRun, ObstacleSender, StereovoxError, open_source
 from stereovox.mavlink.directions import DirectionRules
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
@@ -181,3 +181,16 @@ def test_it_observes_a_run(start_autopilot, tmp_path):
 def test_bad_values_are_refused(bad, words):
     with pytest.raises(StereovoxError, match=words):
         ObstacleSender(Mapper("default"), "udpout:127.0.0.1:14550", **bad)
+
+
+def test_a_lidar_looks_along_its_own_axes(start_autopilot, mapped):
+    """The same pose, told once by a camera and once by a lidar: the autopilot hears the same."""
+    mapper, frame, report = mapped
+    autopilot, heard = start_autopilot(), []
+    T_world_lidar = frame.T_world_sensor @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    for seen in (frame, Cloud(np.ones((1, 3)), T_world_lidar)):
+        with ObstacleSender(mapper, autopilot.url, rate_hz=20, rules=RULES) as sender:
+            sender.after(seen, report)
+            heard.append(autopilot.wait_for("OBSTACLE_DISTANCE")[0]["distances"])
+        autopilot.drain()
+    assert heard[0] == heard[1]

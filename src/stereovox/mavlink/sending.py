@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import StereovoxError
-from stereovox.frame import AnyFrame, UpdateReport
+from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Cloud, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.mavlink.directions import DirectionRules, nearest_places
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
 
+T_BODY_LIDAR = np.eye(4)
+"""Where a lidar is that is not named: at the body's origin, looking ahead."""
+T_BODY_LIDAR[:3, :3] = R_SENSOR_OPTICAL.T
+T_BODY_LIDAR.setflags(write=False)
 HIGHEST_RATE_HZ = 200.0
 PATIENCE = 0.5
 """Share of a period for which a message waits for the next frame."""
@@ -42,7 +46,8 @@ class ObstacleSender:
         rules: What OBSTACLE_DISTANCE says; by default `SectorRules()`.
         directions: What OBSTACLE_DISTANCE_3D says; None: it is not sent.
         mounts: T_body_sensor (4, 4) by the name of the sensor: maps a camera's optical frame into the body in optical
-            axes (x right, y down, z forward). A camera that is not named looks ahead from the body's origin.
+            axes (x right, y down, z forward); of a lidar its own frame (x forward, y left, z up). One that is not named
+            looks ahead from the body's origin.
         tell: Called with one line when sending stops, why, and when it goes on.
 
     Attributes:
@@ -89,7 +94,7 @@ class ObstacleSender:
         """
         if report.refused is not None:
             return
-        mount = self._mounts.get(frame.sensor)
+        mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Cloud) else None)
         T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
         self._T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
         self._new.set()

@@ -50,10 +50,8 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     if not used.any() and not len(clear):
         found = f"{len(points)} points, {measured.sum()} of them finite"
         raise FrameRefused("no_valid_point", f"{name_of(cloud)}: not one ray can be used ({found}); is it covered?")
-    if len(clear) and starts is not None:
+    if starts is not None:
         starts = np.concatenate([starts[used], np.zeros((len(clear), 3))])
-    elif starts is not None:
-        starts = starts[used]
     hits = np.concatenate([~far[used], np.zeros(len(clear), bool)])
     return CheckedCloud(np.concatenate([ends[used], clear]), starts, hits, cloud.lidar, T, int(cloud.stamp_ns))
 

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from stereovox import registry
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyImage, DepthImage
-from stereovox.integrate.points import Points
 from stereovox.maps.evidence import Evidence
+
+if TYPE_CHECKING:
+    from stereovox.integrate.points import Points
 
 INTEGRATORS = {
     "projective": "stereovox.integrate.projective:Projective",
@@ -52,6 +54,8 @@ class Integration:
             return self._images.evidence(image)
         if self._config.device != "cpu":
             raise FrameRefused("no_clouds", "clouds are mapped on the processor only; leave device=cuda out")
+        from stereovox.integrate.points import Points
+
         self._clouds = self._clouds or Points(self._config)
         return self._clouds.evidence(image)
 

@@ -6,16 +6,8 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox._math import floor
 from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of, pack, table_row
-from stereovox.integrate._lanes import (
-    HALF_DIAGONAL,
-    LANES,
-    aim_at_hits,
-    even_to,
-    evidence,
-    free_space,
-    give,
-)
-from stereovox.integrate._ray import _first, _inverse, _step
+from stereovox.integrate._lanes import HALF_DIAGONAL, LANES, _sign, even_to
+from stereovox.integrate._ray import _inverse, first_cell, walk
 
 
 @kernel
@@ -35,25 +27,11 @@ def cast(rays, runs, places, view, table, look_up, lanes, memory, pool_table, co
         free_to = _aim(rays[:, start:stop], position, signs, view, table, lanes)
         if free_to >= NO_RETURN:
             continue
-        reached, going = ZERO, True
-        while going:
-            tableless = reached < min(free_to, even)
-            reached, going, starts = _step(lanes, position, signs)
-            if tableless:
-                total, unlike = free_space(lanes, table, None)
-            else:
-                total, unlike = evidence(lanes, look_up, table, None)
-            if not give(lanes, starts | unlike, total, None, memory, pool_table, coords, count, values):
-                return False
-        starts, total = aim_at_hits(lanes, table, None)
-        if not give(lanes, starts, total, None, memory, pool_table, coords, count, values):
+        if not walk(
+            lanes, position, signs, min(free_to, even), table, look_up, None, memory, pool_table, coords, count, values
+        ):
             return False
     return True
-
-
-@cell
-def _sign(direction):
-    return ONE if direction >= ZERO else -ONE
 
 
 @cell
@@ -63,9 +41,7 @@ def _aim(rays, position, signs, view, table, lanes):
 
     Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
     """
-    x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
-    key = pack(np.int32(x), np.int32(y), np.int32(z), lanes.cell)
-    x, y, z = x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
+    key, x, y, z = first_cell(position, signs, lanes.cell)
     half_cell, nearest = HALF_DIAGONAL * view.voxel_size, bits_of(NO_RETURN)
     n = rays.shape[1]
     for i in range(LANES):

@@ -52,28 +52,48 @@ def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
             if free_to >= NO_RETURN:
                 continue
             _start(ray, position, signs, lanes)
-            reached, going = ZERO, True
-            while going:
-                tableless = reached < min(free_to, even)
-                reached, going, starts = _step(lanes, position, signs)
-                if tableless:
-                    total, unlike = free_space(lanes, table, weight)
-                else:
-                    total, unlike = evidence(lanes, look_up, table, weight)
-                if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
-                    return False
-            starts, total = aim_at_hits(lanes, table, weight)
-            if not give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
+            if not walk(
+                lanes, position, signs, min(free_to, even), table, look_up, weight,
+                memory, pool_table, coords, count, values,
+            ):  # fmt: skip
                 return False
     return True
 
 
 @cell
+def walk(
+    lanes, position, signs, tableless_to, table, look_up, weight, memory, pool_table, coords, count, values
+):  # fmt: skip
+    """Follow all rays from their first cells to their ends, then give their hits; return False when the pool is full.
+
+    tableless_to: depth up to which cells may begin that need no look at the sensor table.
+    """
+    reached, going = ZERO, True
+    while going:
+        tableless = reached < tableless_to
+        reached, going, starts = _step(lanes, position, signs)
+        if tableless:
+            total, unlike = free_space(lanes, table, weight)
+        else:
+            total, unlike = evidence(lanes, look_up, table, weight)
+        if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
+            return False
+    starts, total = aim_at_hits(lanes, table, weight)
+    return give(lanes, starts, total, weight, memory, pool_table, coords, count, values)
+
+
+@cell
+def first_cell(position, signs, keys):
+    """Return the key of the first cell that rays with these signs cross, and the faces at which they leave it."""
+    x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
+    key = pack(np.int32(x), np.int32(y), np.int32(z), keys)
+    return key, x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
+
+
+@cell
 def _start(ray, position, signs, lanes):
     """Put all rays into the first cell they cross."""
-    x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
-    key = pack(np.int32(x), np.int32(y), np.int32(z), lanes.cell)
-    x, y, z = x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
+    key, x, y, z = first_cell(position, signs, lanes.cell)
     for i in range(LANES):
         column = lanes.column[i]
         lanes.entered[i], lanes.cell[i] = ZERO, key

@@ -7,7 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -178,12 +178,12 @@ def score_recording(
     place: Place, key: str, recording: Recording, configs: Sequence[Config], options: ScoreOptions
 ) -> list[RecordingScore]:
     """Score a recording's maps under several settings, and keep that in a place; a task of a worker."""
-    truths, rows = dict[tuple[float, float], TruthCells](), list[RecordingScore]()
+    truths, rows, where = dict[tuple[float, float], TruthCells](), list[RecordingScore](), ""
     with TemporaryDirectory(prefix="stereovox-") as folder:
         for number, config in enumerate(configs):
             started = perf_counter()
             try:
-                where = local(recording.where, Path(folder) / "recording")
+                where = where or local(recording.where, Path(folder) / "recording")  # of an object store once
                 sizes = config.voxel_size, config.max_range
                 if sizes not in truths:  # first: a recording without a lidar is not mapped for nothing
                     source: Any = open_source(where)
@@ -192,7 +192,7 @@ def score_recording(
                 rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
             except StereovoxError as error:
                 rows.append(RecordingScore(recording.where, config.profile, error=str(error)))
-            rows[-1] = RecordingScore(**{**vars(rows[-1]), "seconds": perf_counter() - started})
+            rows[-1] = replace(rows[-1], seconds=perf_counter() - started)
     if not any(row.error for row in rows):  # what failed is tried again
         (place / "scores").write(f"{key}.json", json.dumps([asdict(row) for row in rows]).encode())
     return rows

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, explore
+from stereovox.lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, fly
 from stereovox.lab.flights.flight import World
 
 SHORT = Cruise(seconds=35.0)
@@ -17,7 +17,7 @@ def world():
 
 
 def test_exploring_uncovers_the_hall_and_touches_nothing(world):
-    explored = explore(3, Frontiers(), SHORT, world)
+    explored, _ = fly(3, Frontiers(), SHORT, world)
     assert explored.collided_s is None
     assert explored.clearance_m > SHORT.airframe.radius
     shares = [share for _, share in explored.coverage]
@@ -30,7 +30,7 @@ def test_exploring_uncovers_the_hall_and_touches_nothing(world):
 
 def test_the_middle_has_more_room_than_the_start(world):
     mission = MiddleOfRoom()
-    explored = explore(3, mission, replace(SHORT, seconds=90.0), world)
+    explored, _ = fly(3, mission, replace(SHORT, seconds=90.0), world)
     assert explored.done
     assert explored.collided_s is None
     start = world.start(np.random.default_rng([3, 1]))
@@ -55,7 +55,7 @@ class Through:
 
 def test_ways_that_are_not_free_are_not_flown(world):
     """The check ahead stops it, whatever the mission says."""
-    explored = explore(3, Through(), replace(SHORT, seconds=90.0), world)
+    explored, _ = fly(3, Through(), replace(SHORT, seconds=90.0), world)
     assert explored.collided_s is None
     assert explored.goals == 3
     assert explored.clearance_m > SHORT.airframe.radius
@@ -63,7 +63,7 @@ def test_ways_that_are_not_free_are_not_flown(world):
 
 def test_without_the_check_ahead_it_collides_and_that_is_told(world):
     """The control of the test above: a vehicle that takes all before it for its own place flies on."""
-    explored = explore(3, Through(), replace(SHORT, seconds=60.0, own_radius=50.0, camera_hz=2.0), world)
+    explored, _ = fly(3, Through(), replace(SHORT, seconds=60.0, own_radius=50.0, camera_hz=2.0), world)
     assert explored.collided_s is not None
     assert explored.seconds == explored.collided_s
     assert explored.clearance_m < SHORT.airframe.radius

@@ -172,7 +172,9 @@ class Explored:
         return asdict(self)
 
 
-def explore(seed: int, mission: Mission, cruise: Cruise | None = None, world: World | None = None) -> Explored:
+def fly(
+    seed: int, mission: Mission, cruise: Cruise | None = None, world: World | None = None
+) -> tuple[Explored, VoxelMap]:
     """Fly a mission.
 
     Args:
@@ -182,15 +184,8 @@ def explore(seed: int, mission: Mission, cruise: Cruise | None = None, world: Wo
         world: The scene, if it is made already.
 
     Returns:
-        What became of it.
+        What became of it, and the map that was made.
     """
-    return fly(seed, mission, cruise, world)[0]
-
-
-def fly(
-    seed: int, mission: Mission, cruise: Cruise | None = None, world: World | None = None
-) -> tuple[Explored, VoxelMap]:
-    """Return what `explore` does, and the map that was made."""
     cruise = cruise or Cruise()
     flown = _Mission(seed, mission, cruise, world or World(cruise.scene.format(seed=seed)))
     return flown.run(), flown.map

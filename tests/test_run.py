@@ -105,9 +105,9 @@ class Stateful:
 def test_frames_are_prepared_in_advance_on_two_threads_and_the_map_is_the_same(tmp_path, monkeypatch):
     prepared_by, plain = [], deadline.prepared
 
-    def prepare(depth, frame):
+    def prepare(*given):
         prepared_by.append(current_thread())
-        return plain(depth, frame)
+        return plain(*given)
 
     monkeypatch.setattr(deadline, "prepared", prepare)
     seen = {}

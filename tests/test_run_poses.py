@@ -43,9 +43,9 @@ def same_cells(a, b):
 def test_on_two_threads_the_next_frame_is_tracked_while_one_is_prepared_and_the_map_is_the_same(tmp_path, monkeypatch):
     prepared_by, plain = [], deadline.prepared
 
-    def prepare(depth, frame):
+    def prepare(*given):
         prepared_by.append(current_thread())
-        return plain(depth, frame)
+        return plain(*given)
 
     monkeypatch.setattr(deadline, "prepared", prepare)
     where = unposed(tmp_path / "a", covered=[5])

@@ -7,9 +7,10 @@ Images (a D435's, 848x480, without reasons) of a loop through the furnished room
 process of its own then plays them in real time: it tells of each image when it is due, and sends the poses of the body
 200 times a second as lines over UDP; with `--poses track` it sends what an IMU feels instead, and the camera is
 tracked. Several cameras look round, 360 degrees shared out. The page is open: another process reads what the page
-draws. 2-D map and distances all round are kept up to date (with --record a recording as well). Latency is from the
-stamp, which is when the image is due, until the map and until its outputs have it; share: CPU time of the mapping
-process alone. At the end the same images are mapped offline in the same order: `cells_that_differ`.
+draws. Another is the autopilot, which is sent OBSTACLE_DISTANCE ten times a second. 2-D map and distances all round are
+kept up to date (with --record a recording as well). Latency is from the stamp, which is when the image is due, until
+the map and its outputs have it, and until the autopilot has a message of it (`obstacles`); share: CPU time of the
+mapping process alone. At the end the same images are mapped offline in the same order: `cells_that_differ`.
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from obstacle_latency import listen
 from scipy.spatial.transform import Rotation
 
 import stereovox as sv
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
+from stereovox.evaluate.summary import percentiles
 from stereovox.frame import UpdateReport
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun
@@ -130,10 +133,24 @@ class Noted:
     def __init__(self) -> None:
         self.offered: list[tuple[str, int, Transform, str | None, str]] = []
         self.refused = 0
+        self._mapped: list[tuple[float, float]] = []
 
     def after(self, frame: Any, report: UpdateReport) -> None:
         self.offered.append((frame.sensor, frame.stamp_ns, frame.T_world_sensor, frame.fault, frame.name))
         self.refused += bool(report.refused)
+        if not report.refused:
+            self._mapped.append((monotonic(), (time_ns() - frame.stamp_ns) / 1e9))
+
+    def heard_ms(self, came: list[tuple[float, float]]) -> list[float]:
+        """Return how old the images were that messages told of, from their stamps until the messages came.
+
+        came: when each message came, and since when the image it tells of was being mapped, both by `monotonic`.
+        """
+        done, age = np.array(self._mapped).reshape(-1, 2).T
+        at, since = np.array(came).reshape(-1, 2).T
+        image = np.searchsorted(done, since, "right")  # the first that was mapped after that began
+        at, image = at[image < len(done)], image[image < len(done)]
+        return (1e3 * (at - done[image] + age[image])).tolist()
 
 
 def play(tell: list[Connection], scene: str, hz: float, seconds: float, port: int, imu: bool, ready: Any) -> None:
@@ -241,11 +258,14 @@ def main() -> None:
             daemon=True,
         )  # fmt: skip
         player.start()
+        autopilot, told = context.Pipe()
+        context.Process(target=listen, args=(told,), daemon=True).start()
         out = os.path.join(folder, "map.svox")
         with LiveRun(cameras, out, poses="track" if tracked else f"udp://:{port}", notify=say, **settings) as run:
             record = os.path.join(folder, "log.mcap") if wanted.record else None
             view = None if wanted.no_page else 0
-            run.add_outputs(grid=os.path.join(folder, "grid.yaml"), sphere=True, record=record, view=view)
+            grid, mavlink = os.path.join(folder, "grid.yaml"), f"udpout:127.0.0.1:{autopilot.recv()}"
+            run.add_outputs(grid=grid, sphere=True, record=record, view=view, mavlink=mavlink)
             if run.page:
                 page = int(run.page.split(":")[2].split("/")[0])
                 context.Process(target=look, args=(page, shown), daemon=True).start()
@@ -253,6 +273,8 @@ def main() -> None:
             run.stream.on_start = ready.set
             done = run.finish([noted])
             say(f"done after {monotonic() - begin:.0f} s")
+        autopilot.send("end")
+        heard_ms = noted.heard_ms(autopilot.recv())
         same = differing(done.map, offline(noted, film, names, settings))
     sent = round(wanted.seconds * wanted.hz) * wanted.cameras
     live = done.live
@@ -261,7 +283,8 @@ def main() -> None:
         "size": [film.camera.width, film.camera.height], "sent": sent,
         "received": sum(one["received"] for one in live["cameras"].values()),
         "dropped": live["dropped"], "offered": len(noted.offered), "refused": done.summary()["refused"],
-        "lost": sent - len(noted.offered), "latency_ms": live["latency_ms"], "cpu_share": live["cpu_share"],
+        "lost": sent - len(noted.offered), "latency_ms": {**live["latency_ms"], "obstacles": percentiles(heard_ms)},
+        "messages": len(heard_ms), "cpu_share": live["cpu_share"],
         "cells_that_differ": same, "occupied": done.summary()["occupied"], "load": os.getloadavg()[0],
         "page_bytes": shown.value, "recorded": live.get("recorded"), "poses_added": live.get("poses", {}).get("added"),
     }  # fmt: skip

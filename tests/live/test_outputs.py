@@ -3,15 +3,16 @@
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_live import CAMERA, wall
 
 from stereovox.depth.sphere import T_BODY_OPTICAL
-from stereovox.errors import SourceError, StereovoxError
+from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
-from stereovox.frame import Frame, UpdateReport
+from stereovox.frame import Frame, Photo, UpdateReport
 from stereovox.live.latency import Latency
 from stereovox.live.outputs import GridFile, LiveSphere
 from stereovox.live.recorder import WAITING, Recorder, optical, topic
@@ -114,6 +115,24 @@ def test_images_without_a_pose_are_recorded_too(tmp_path):
     first, second = open_source(tmp_path / "log.mcap")
     assert not first.fault
     assert second.pose_off_ns == 33 * MS  # nobody said where: the reader tells how far it had to guess
+
+
+def test_pictures_are_recorded_with_their_place(tmp_path):
+    def unreadable():
+        raise FrameRefused("unreadable", "torn")
+
+    T = np.eye(4)
+    T[0, 3] = 0.015
+    pictures = [np.full((CAMERA.height, CAMERA.width), 40 + k, np.uint8) for k in range(2)]
+    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL})
+    for k, pixels in enumerate([pictures[0], lambda: pictures[1], unreadable]):
+        recorder.after(replace(frame(k), photo=Photo(pixels, CAMERA, T)), UpdateReport())
+    recorder.finish()
+    assert recorder.counts == {"images": 3}
+    again = list(open_source(tmp_path / "log.mcap"))
+    for one, grey in zip(again, pictures, strict=False):
+        np.testing.assert_array_equal(one.photo.pixels(), grey)
+        np.testing.assert_allclose(one.photo.T_sensor_camera, T, atol=1e-12)
 
 
 def test_nothing_is_left_of_a_recording_without_images(tmp_path):

@@ -22,6 +22,11 @@ def depth(k: int) -> np.ndarray:
     return image.astype(np.uint16)
 
 
+def picture(k: int) -> np.ndarray:
+    """The grey picture (HEIGHT, WIDTH) that comes with depth image `k`."""
+    return ((7 * k + np.arange(WIDTH * HEIGHT)) % 251).astype(np.uint8).reshape(HEIGHT, WIDTH)
+
+
 def stamp_ns(k: int) -> int:
     """Whole quarters of a millisecond, which a float of milliseconds can tell exactly."""
     return (START_QUARTERS + 133 * k) * 250_000
@@ -45,6 +50,7 @@ class SoftwareCamera:
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Software D435")
         self.device.register_info(rs.camera_info.serial_number, serial)
+        self.colour: Any = None
         self.sensor = self.device.add_sensor("Stereo Module")
         profiles = [self._add(rs.stream.depth, 0, mode, rs.format.z16, 2) for mode in depth_modes]
         self.profile = profiles[0]
@@ -59,20 +65,55 @@ class SoftwareCamera:
             limits.min, limits.max, limits.step, limits.default = 0, largest, 1, 1
             self.sensor.add_option(option, limits, True)
 
-    def _add(self, kind: Any, index: int, mode: tuple[int, int, int], form: Any, bpp: int) -> Any:
+    def _add(
+        self, kind: Any, index: int, mode: tuple[int, int, int], form: Any, bpp: int, sensor: Any = None,
+        coefficients: list[float] | None = None,
+    ) -> Any:  # fmt: skip
         stream = self._rs.video_stream()
         stream.type, stream.index, stream.fmt, stream.bpp = kind, index, form, bpp
         stream.width, stream.height, stream.fps = mode
         stream.uid = 100 * index + hash(mode) % 97 + 1000 * int(kind)
         stream.intrinsics = intrinsics(self._rs, *mode[:2])
-        return self.sensor.add_video_stream(stream)
+        if coefficients is not None:
+            lens = stream.intrinsics
+            lens.coeffs = coefficients
+            stream.intrinsics = lens
+        return (sensor or self.sensor).add_video_stream(stream)
+
+    def add_pictures(self, form: Any, late_ns: int = 0, coefficients: list[float] | None = None) -> None:
+        """Add a colour camera 15 mm to the right of the depth camera, whose pictures are `late_ns` behind it."""
+        rs = self._rs
+        self.colour = self.device.add_sensor("RGB Camera")
+        self.colour_form, self.late_ns = form, late_ns
+        self.colour_profile = self._add(
+            rs.stream.color, 0, (WIDTH, HEIGHT, FPS), form, 3 if form == rs.format.rgb8 else 2, self.colour,
+            [*(coefficients or []), *[0.0] * 5][:5],
+        )  # fmt: skip
+        beside = rs.extrinsics()
+        beside.rotation, beside.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0.015, 0, 0]
+        self.colour_profile.register_extrinsics_to(self.profile, beside)
+
+    def _send_picture(self, k: int) -> None:
+        rs, grey = self._rs, picture(k)
+        frame = rs.software_video_frame()
+        if self.colour_form == rs.format.rgb8:
+            frame.pixels, frame.stride, frame.bpp = np.stack([grey] * 3, axis=-1).copy(), 3 * WIDTH, 3
+        else:
+            packed = np.stack([grey, np.full_like(grey, 128)], axis=-1)  # chroma of grey
+            frame.pixels, frame.stride, frame.bpp = packed.copy(), 2 * WIDTH, 2
+        frame.timestamp, frame.domain = (stamp_ns(k) + self.late_ns) / 1e6, rs.timestamp_domain.hardware_clock
+        frame.frame_number = k
+        frame.profile = self.colour_profile.as_video_stream_profile()
+        self.colour.on_video_frame(frame)
 
     def query_devices(self) -> list[Any]:
         """This camera as if it were all of `rs.context()`, whose list leaves software devices out."""
         return [self.device]
 
     def send(self, k: int) -> None:
-        """Let the sensor take depth image `k`."""
+        """Let the sensors take depth image and picture `k`."""
+        if self.colour is not None:
+            self._send_picture(k)
         frame = self._rs.software_video_frame()
         frame.pixels, frame.stride, frame.bpp = depth(k), 2 * WIDTH, 2
         frame.timestamp, frame.domain = stamp_ns(k) / 1e6, self._rs.timestamp_domain.hardware_clock

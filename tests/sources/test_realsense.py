@@ -11,7 +11,7 @@ import pytest
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 has no wheel for this Python", exc_type=ImportError)
 
-from made_realsense import FPS, HEIGHT, UNIT, WIDTH, SoftwareCamera, depth, stamp_ns  # noqa: E402
+from made_realsense import FPS, HEIGHT, UNIT, WIDTH, SoftwareCamera, depth, picture, stamp_ns  # noqa: E402
 
 from stereovox.cli import main, recordings  # noqa: E402
 from stereovox.errors import MissingExtra, SourceError  # noqa: E402
@@ -71,6 +71,63 @@ def test_without_a_pose_the_depth_is_there_and_says_how_to_get_one(camera):
     assert "?pose=fixed" in frame.fault_detail
     assert "pair.toml" in frame.fault_detail
     assert frame.depth.shape == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("form", ["yuyv", "rgb8"])
+def test_pictures_come_with_the_depth_images_of_their_time(camera, form):
+    camera.add_pictures(getattr(rs.format, form))
+    stream = open_stream("realsense:")
+    assert stream.notes == ()
+    with camera.sending():
+        frames = list(islice(stream, 6))
+    with pytest.raises(RuntimeError, match="not streaming"):
+        camera.colour.stop()
+    for frame in frames:
+        assert frame.photo is not None
+        grey = frame.photo.pixels if form == "yuyv" else frame.photo.pixels[..., 1]
+        np.testing.assert_array_equal(grey, picture(number(frame)))
+        assert (frame.photo.camera.width, frame.photo.camera.fx) == (WIDTH, 24.0)
+        np.testing.assert_allclose(frame.photo.T_sensor_camera[:3, 3], [0.015, 0, 0])
+
+
+def test_of_pictures_at_other_times_the_nearest_is_taken_and_none_that_is_far(camera):
+    camera.add_pictures(rs.format.yuyv, late_ns=-25_000_000)  # the next one is 8 ms after its depth image
+    with camera.sending():
+        for frame in islice(open_stream("realsense:"), 3):
+            np.testing.assert_array_equal(frame.photo.pixels, picture(number(frame) + 1))
+    camera.late_ns = -1_000_000_000
+    with camera.sending():
+        assert all(frame.photo is None for frame in islice(open_stream("realsense:"), 3))
+
+
+def test_pictures_of_a_lens_that_distorts_are_straightened(camera):
+    camera.add_pictures(rs.format.yuyv, coefficients=[-0.3, 0.1])
+    with camera.sending():
+        frame = next(iter(open_stream("realsense:")))
+    from_corner = frame.photo.pixels[0, 0]
+    assert from_corner != picture(number(frame))[0, 0]
+    middle = HEIGHT // 2, WIDTH // 2
+    assert frame.photo.pixels[middle] == picture(number(frame))[middle]
+
+
+@pytest.mark.parametrize("options", ["?photo=off", "?pose=fixed"])
+def test_pictures_can_be_left_out(camera, options):
+    camera.add_pictures(rs.format.yuyv)
+    with camera.sending():
+        assert next(iter(open_stream(f"realsense:{options}"))).photo is None
+
+
+def test_a_colour_camera_whose_place_is_unknown_is_told_of_and_left_out(camera, monkeypatch):
+    camera.add_pictures(rs.format.yuyv)
+
+    def unknown(one, other):
+        raise RuntimeError("Requested extrinsics are not available!")
+
+    monkeypatch.setattr("stereovox.sources.realsense_photo.transform_between", unknown)
+    stream = open_stream("realsense:")
+    assert stream.notes == ("realsense:042: its colour camera is not used (Requested extrinsics are not available!)",)
+    with camera.sending():
+        assert next(iter(stream)).photo is None
 
 
 def test_the_camera_stops_with_its_consumer_and_starts_again(camera):

@@ -139,7 +139,7 @@ def plugged(monkeypatch):
 
         names = ("emitter_enabled", "laser_power", "stereo_baseline")
         rs = SimpleNamespace(
-            stream=SimpleNamespace(depth="depth", gyro="gyro", accel="accel", infrared="infrared"),
+            stream=SimpleNamespace(depth="depth", gyro="gyro", accel="accel", infrared="infrared", color="color"),
             format=SimpleNamespace(z16="z16"), camera_info=SimpleNamespace(serial_number="serial"),
             option=SimpleNamespace(**{name: name for name in names}), frame_queue=queue, context=lambda: camera,
         )  # fmt: skip

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.errors import StereovoxError
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame, UpdateReport
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.bags.writer import BagWriter
@@ -32,8 +33,9 @@ class Recorder:
     """Writes images, poses of the body and mounts to a bag, in a thread of its own; an output of a live run.
 
     Topics: `/NAME/depth/image_rect_raw` and `camera_info` beside it, `/tf` (odom to base_link at the time of each image
-    that has a pose), `/tf_static` (mounts), and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or
-    float metres where the source has these. Images that the map refused are recorded, too.
+    that has a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` where pictures are taken
+    along, and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or float metres where the source has
+    these. Images that the map refused are recorded, too.
 
     Args:
         file: `.mcap`, `.bag` or `.db3`; it is complete at the end, and there is none before.
@@ -63,6 +65,7 @@ class Recorder:
         self.file, self.counts = Path(file), Counter[str]()
         self._mounts, self._imus, self._notify = mounts, imus or {}, notify
         self._heard: dict[str, int] = {}
+        self._pictured: set[str] = set()
         self._queue: Queue[Frame] = Queue(WAITING)
         self._ended = Event()
         self._bag = BagWriter(file)
@@ -114,8 +117,20 @@ class Recorder:
         if np.isfinite(T).all():
             self._bag.transform(stamp_ns, WORLD, BODY, T @ inverse(self._mounts[name]))
         self._bag.depth(frame, f"/{topic(name)}/depth/image_rect_raw", optical(name))
+        self._write_photo(name, frame)
         self._write_imu(name, stamp_ns)
         self.counts["images"] += 1
+
+    def _write_photo(self, name: str, frame: Frame) -> None:
+        if frame.photo is None:
+            return
+        T = np.asarray(frame.photo.T_sensor_camera, float)
+        beside = optical(name) if np.array_equal(T, np.eye(4)) else f"{topic(name)}_color_optical_frame"
+        with suppress(FrameRefused):  # a picture that cannot be read is none
+            self._bag.photo(frame, f"/{topic(name)}/color/image_raw", beside)
+            if beside != optical(name) and name not in self._pictured:
+                self._bag.fixed(optical(name), beside, T)
+                self._pictured.add(name)
 
     def _write_imu(self, name: str, stamp_ns: int) -> None:
         imu = self._imus.get(name)

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,10 @@ from stereovox.frame import Frame
 from stereovox.sources import parameters
 from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu
-from stereovox.sources.realsense_imu import FIRST_IMAGES, FIRST_S, MotionSensor, find_motion, ns_from_ms
+from stereovox.sources.realsense_imu import FIRST_IMAGES, FIRST_S, find_motion, ns_from_ms
+from stereovox.sources.realsense_photo import find_photos
+
+T = TypeVar("T")
 
 PREFIX = "realsense:"
 WAITING = 2
@@ -32,7 +35,8 @@ class Options:
 
     width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
     baseline: metres between the two infrared cameras, where the camera does not report it. pose: `fixed` for a camera
-    at rest; every pose is then the identity. imu: `off` to leave gyroscope and accelerometer out.
+    at rest; every pose is then the identity. imu: `off` to leave gyroscope and accelerometer out. photo: `off` to leave
+    the colour camera out.
     """
 
     width: int = 0
@@ -43,12 +47,14 @@ class Options:
     baseline: float = 0.0
     pose: str = ""
     imu: str = ""
+    photo: str = ""
 
     def __post_init__(self) -> None:
         if self.pose not in ("", "fixed"):
             raise SourceError(f"pose={self.pose} must be fixed")
-        if self.imu not in ("", "off"):
-            raise SourceError(f"imu={self.imu} must be off, or left out")
+        for key in ("imu", "photo"):
+            if getattr(self, key) not in ("", "off"):
+                raise SourceError(f"{key}={getattr(self, key)} must be off, or left out")
         for key in ("width", "height", "fps", "baseline", "emitter", "laser_power"):
             unset = key in ("emitter", "laser_power") and getattr(self, key) == -1
             if getattr(self, key) < 0 and not unset:
@@ -84,17 +90,18 @@ class RealSense(Stream):
         except RuntimeError as error:
             _failed(location, error)
         self.name = PREFIX + _serial(self._rs, self._device)
-        self._motion = self._find_motion()
         self.posed = self.options.pose == "fixed"
+        self._motion = self._beside("IMU", self.options.imu, lambda *found: find_motion(*found, self.name))
+        self._photos = self._beside("colour camera", self.options.photo, find_photos)
 
-    def _find_motion(self) -> MotionSensor | None:
-        """Return the IMU, None where there is none, or where the camera does not say how it is mounted."""
-        if self.options.imu == "off" or self.options.pose == "fixed":
+    def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any], T | None]) -> T | None:
+        """Return a sensor that helps to track, None where there is none, or the camera does not say where it is."""
+        if self.posed or option == "off":
             return None
         try:
-            return find_motion(self._rs, self._device, self._profile, self.name)
+            return find(self._rs, self._device, self._profile)
         except (RuntimeError, StereovoxError) as error:
-            self.notes = (*self.notes, f"{self.name}: its IMU is not used ({' '.join(str(error).split())})")
+            self.notes = (*self.notes, f"{self.name}: its {what} is not used ({' '.join(str(error).split())})")
             return None
 
     def imu(self) -> LiveImu | None:
@@ -122,6 +129,8 @@ class RealSense(Stream):
                 _failed(self.name, error)
             if self._motion is not None and not self._motion.start():
                 self._motion = None
+            if self._photos is not None and not self._photos.start():
+                self._photos = None
             for number in count():
                 arrived, image = queue.try_wait_for_frame(PATIENCE_MS)
                 if not arrived:
@@ -141,6 +150,8 @@ class RealSense(Stream):
     def _stop(self) -> None:
         if self._motion is not None:
             self._motion.stop()
+        if self._photos is not None:
+            self._photos.stop()
         for end in (self._sensor.stop, self._sensor.close):
             try:
                 end()
@@ -158,7 +169,7 @@ class RealSense(Stream):
         detail += " and put poses beside the recording in a camera pair (pair.toml)"
         return Frame(
             depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
-            fault="no_pose", fault_detail=detail,
+            fault="no_pose", fault_detail=detail, photo=self._photos and self._photos.near(stamp_ns),
         )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from stereovox.se3 import Transform
 from stereovox.sources.imu import LiveImu
 
 WAITING = 2000
@@ -66,7 +67,9 @@ def find_motion(rs: Any, device: Any, depth_profile: Any, name: str) -> MotionSe
                 if profile.stream_type() == getattr(rs.stream, key) and profile.fps() > _fps(found.get(key)):
                     found[key] = profile
         if "gyro" in found:
-            return MotionSensor(rs, sensor, found, LiveImu(_mount(found["gyro"], depth_profile), f"{name} IMU"))
+            return MotionSensor(
+                rs, sensor, found, LiveImu(transform_between(found["gyro"], depth_profile), f"{name} IMU")
+            )
     return None
 
 
@@ -76,14 +79,14 @@ def ns_from_ms(milliseconds: float) -> int:
     return int(whole) * 1_000_000 + round(rest * 1e6)
 
 
-def _fps(profile: Any) -> float:
-    return -1 if profile is None else profile.fps()
-
-
-def _mount(gyro: Any, depth: Any) -> Any:
-    """Return T_depth_imu (4, 4) by the camera's own calibration; librealsense stores rotations column by column."""
+def transform_between(one: Any, other: Any) -> Transform:
+    """Return T_other_one (4, 4) of two streams by the camera's own calibration; raises RuntimeError without one."""
     T = np.eye(4)
-    found = gyro.get_extrinsics_to(depth)
-    T[:3, :3] = np.reshape(found.rotation, (3, 3)).T
+    found = one.get_extrinsics_to(other)
+    T[:3, :3] = np.reshape(found.rotation, (3, 3)).T  # librealsense stores rotations column by column
     T[:3, 3] = found.translation
     return T
+
+
+def _fps(profile: Any) -> float:
+    return -1 if profile is None else profile.fps()

@@ -2,19 +2,23 @@
 """Clouds of a lidar: time a cloud and how well a held-out one is foretold, beside other libraries on the same points.
 
     python benchmarks/clouds.py 'DRIVE?sensor=velodyne' [--voxel-size 0.2] [--max-range 60] [--every 5] [--frames A:B:S]
-        [--peers octomap octomap-rays] [--rounds 3] [setting=value ...]
+        [--peers octomap octomap-cpp wavemap-cpp] [--rounds 3] [setting=value ...]
 
 Each map is made of all clouds but every fifth. Time: of the library's own call, the median over clouds of the best of
-some rounds, each beginning with an empty map; one thread, and two for stereovox. Foretold: of the points held out, the
+some rounds, each beginning with an empty map; one thread, and two for stereovox. Libraries in C++ are those of
+`benchmarks/build_peers.py` (STEREOVOX_PEERS), with the points in their own types before the clock starts; wavemap has
+an HDL-64's 64 x 2048 beams, from -24.9 to 2 degrees. Foretold: of the points held out, the
 share in cells that are occupied, or within a cell of one; of places along their rays, at least two cells before the
 point and a metre from the sensor, the shares that are free, unknown and (wrongly) occupied. kiss-icp's map keeps points
-and knows nothing of free space; where it is installed, its time stands beside.
+and knows nothing of free space; where it is installed, its time stands beside, as do those of libraries in C++ whose
+adapters cannot be asked.
 """
 
 import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -24,7 +28,8 @@ from numpy.typing import NDArray
 from stereovox.config import load_config, parse_value
 from stereovox.errors import StereovoxError
 from stereovox.frame import Cloud
-from stereovox.lab.bench.peers import find_peer
+from stereovox.lab.bench.native import WavemapCpp
+from stereovox.lab.bench.peers import UNKNOWN, find_peer
 from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.opening import open_source
@@ -32,7 +37,10 @@ from stereovox.opening import open_source
 ALONG = 8
 """Places on each held-out ray."""
 SEED = 0
-Insert = Callable[[Cloud], object]
+HDL_64 = float(np.radians(-24.9)), float(np.radians(2.0)), 64, 2048
+"""Lowest and highest beam, beams above each other, and directions of a turn at 10 Hz."""
+Insert = Callable[[Cloud], Callable[[], object]]
+"""Returns the call that inserts a cloud, which is what is timed."""
 Ask = Callable[[NDArray[np.float64]], NDArray[np.uint8]]
 
 
@@ -44,17 +52,20 @@ def ours(size: float, max_range: float, threads: int, settings: dict[str, Any]) 
         if report.refused:
             raise StereovoxError(report.detail)
 
-    return insert, lambda points: np.asarray(mapper.map.state(points), np.uint8)
+    return lambda cloud: partial(insert, cloud), lambda points: np.asarray(mapper.map.state(points), np.uint8)
 
 
-def peer(name: str, size: float, max_range: float) -> tuple[Insert, Ask]:
+def peer(name: str, size: float, max_range: float) -> tuple[Insert, Ask | None]:
     kind: Any = find_peer(name)
     library = kind(size)
     library.reach(max_range)
+    if isinstance(library, WavemapCpp):
+        return partial(of_wavemap, library), lambda points: states_of(library.log_odds(points))
     states: dict[tuple[int, ...], int] = {}
 
-    def insert(cloud: Cloud) -> None:
-        library.insert(*in_world(cloud))
+    def insert(cloud: Cloud) -> Callable[[], object]:
+        given = in_world(cloud)
+        return library.prepared(*given) if hasattr(library, "prepared") else partial(library.insert, *given)
 
     def ask(points: NDArray[np.float64]) -> NDArray[np.uint8]:
         if not states:
@@ -65,7 +76,17 @@ def peer(name: str, size: float, max_range: float) -> tuple[Insert, Ask]:
         cells = np.floor(points / size).astype(np.int64).tolist()
         return np.array([states.get(tuple(cell), int(State.UNKNOWN)) for cell in cells], np.uint8)
 
-    return insert, ask
+    return insert, ask if hasattr(library, "cells") else None
+
+
+def of_wavemap(library: WavemapCpp, cloud: Cloud) -> Callable[[], object]:
+    far = np.linalg.norm(cloud.points, axis=1) >= cloud.lidar.range_min
+    return library.prepared_cloud(cloud.points[far].astype(float), cloud.T_world_sensor, HDL_64)
+
+
+def states_of(log_odds: NDArray[np.float32]) -> NDArray[np.uint8]:
+    known = np.where(log_odds > 0, int(State.OCCUPIED), int(State.FREE))
+    return np.where(np.abs(log_odds) > UNKNOWN, known, int(State.UNKNOWN)).astype(np.uint8)
 
 
 def kiss(size: float, max_range: float) -> Insert:
@@ -73,10 +94,7 @@ def kiss(size: float, max_range: float) -> Insert:
 
     library = VoxelHashMap(size, max_range, 20)
 
-    def insert(cloud: Cloud) -> None:
-        library.update(cloud.points.astype(np.float64), cloud.T_world_sensor)
-
-    return insert
+    return lambda cloud: partial(library.update, cloud.points.astype(np.float64), cloud.T_world_sensor)
 
 
 def in_world(cloud: Cloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -115,8 +133,9 @@ def timed(make: Callable[[], Insert], clouds: list[Cloud], rounds: int) -> float
     for row in took:
         insert = make()
         for k, cloud in enumerate(clouds):
+            call = insert(cloud)
             started = time.perf_counter()
-            insert(cloud)
+            call()
             row[k] = time.perf_counter() - started
     return 1e3 * float(np.median(took.min(axis=0)))
 
@@ -129,7 +148,7 @@ def main() -> None:
     parser.add_argument("--max-range", type=float, default=60.0)
     parser.add_argument("--every", type=int, default=5)
     parser.add_argument("--frames")
-    parser.add_argument("--peers", nargs="*", default=["octomap", "octomap-rays"])
+    parser.add_argument("--peers", nargs="*", default=["octomap"])
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
     settings = {name: parse_value(text) for name, _, text in (one.partition("=") for one in arguments.settings)}
@@ -138,7 +157,7 @@ def main() -> None:
     held = clouds[arguments.every // 2 :: arguments.every]
     used = [cloud for cloud in clouds if cloud not in held]
     size, far = arguments.voxel_size, arguments.max_range
-    makers: dict[str, Callable[[], tuple[Insert, Ask]]] = {
+    makers: dict[str, Callable[[], tuple[Insert, Ask | None]]] = {
         "stereovox": lambda: ours(size, far, 1, settings),
         "stereovox, 2 threads": lambda: ours(size, far, 2, settings),
         **{name: lambda name=name: peer(name, size, far) for name in arguments.peers},
@@ -146,12 +165,12 @@ def main() -> None:
     print(f"{len(used)} clouds of {np.mean([len(cloud.points) for cloud in used]):,.0f} points, {len(held)} held out")
     for name, make in makers.items():
         rounds = arguments.rounds if name.startswith("stereovox") else 1
-        ours(size, far, 1, settings)[0](used[0])  # compiled now
+        ours(size, far, 1, settings)[0](used[0])()  # compiled now
         row: dict[str, Any] = {"name": name, "ms": round(timed(lambda make=make: make()[0], used, rounds), 1)}
         insert, ask = make()
         for cloud in used:
-            insert(cloud)
-        print(json.dumps(row | foretold(held, ask, size, far)), flush=True)
+            insert(cloud)()
+        print(json.dumps(row | (foretold(held, ask, size, far) if ask else {})), flush=True)
     try:
         print(json.dumps({"name": "kiss-icp's map of points", "ms": round(timed(lambda: kiss(size, far), used, 1), 1)}))
     except ImportError:

@@ -6,11 +6,12 @@
 Images (a D435's, 848x480, without reasons) of a loop through the furnished room are rendered first. A player in a
 process of its own then plays them in real time: it tells of each image when it is due, and sends the poses of the body
 200 times a second as lines over UDP; with `--poses track` it sends what an IMU feels instead, and the camera is
-tracked. Several cameras look round, 360 degrees shared out. The page is open: another process reads what the page
-draws. Another is the autopilot, which is sent OBSTACLE_DISTANCE ten times a second. 2-D map and distances all round are
-kept up to date (with --record a recording as well). Latency is from the stamp, which is when the image is due, until
-the map and its outputs have it, and until the autopilot has a message of it (`obstacles`); share: CPU time of the
-mapping process alone. At the end the same images are mapped offline in the same order: `cells_that_differ`.
+tracked by depth, IMU and the grey pictures of a pattern on all surfaces (`--contrast 0`: no pictures). Several cameras
+look round, 360 degrees shared out. The page is open: another process reads what the page draws. Another is the
+autopilot, which is sent OBSTACLE_DISTANCE ten times a second. 2-D map and distances all round are kept up to date (with
+--record a recording as well). Latency is from the stamp, which is when the image is due, until the map and its outputs
+have it, and until the autopilot has a message of it (`obstacles`); share: CPU time of the mapping process alone. At the
+end the same images are mapped offline in the same order: `cells_that_differ`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from obstacle_latency import listen
 from scipy.spatial.transform import Rotation
 
 import stereovox as sv
+from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.evaluate.summary import percentiles
@@ -42,7 +44,8 @@ from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun
 from stereovox.maps.storage import EVERYWHERE
 from stereovox.se3 import Transform, inverse, rotation_vector
-from stereovox.simulate.simulation import Simulation
+from stereovox.simulate.rendering import photograph
+from stereovox.simulate.simulation import GREY_NOISE, Simulation
 from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu
 
@@ -68,10 +71,13 @@ class Way:
 
 
 class Film:
-    """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one way through the loop."""
+    """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one way through the loop.
 
-    def __init__(self, file: str, count: int, mounts: list[Transform], camera: PinholeCamera):
-        self.file, self.count, self.mounts, self.camera = file, count, mounts, camera
+    With a contrast above 0, pictures of the first camera in another, (images, height, width) uint8.
+    """
+
+    def __init__(self, file: str, count: int, mounts: list[Transform], camera: PinholeCamera, contrast: float):
+        self.file, self.count, self.mounts, self.camera, self.contrast = file, count, mounts, camera, contrast
         self.shape = count, len(mounts), camera.height, camera.width
 
     def render(self, way: Way, hz: float) -> None:
@@ -86,6 +92,20 @@ class Film:
                 depth = way.simulation.scene.cast(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32))
                 images[k, c] = device.measure(depth.reshape(camera.height, camera.width), [c, k], T)[0]
         images.flush()
+        if self.contrast:
+            lens = Lens("pinhole", camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+            pictures = np.memmap(self.file + "_grey", np.uint8, "w+", shape=(self.count, camera.height, camera.width))
+            for k in range(self.count):
+                T = way.at(k / hz) @ self.mounts[0]
+                pictures[k] = photograph(way.simulation.scene, lens, T, GREY_NOISE, [k], self.contrast)
+            pictures.flush()
+
+    def photo(self, k: int, camera: int) -> sv.Photo | None:
+        """Return the picture that is taken with image `k` of a camera."""
+        if camera or not self.contrast:
+            return None
+        shape = self.count, self.camera.height, self.camera.width
+        return sv.Photo(np.array(np.memmap(self.file + "_grey", np.uint8, "r", shape=shape)[k]), self.camera)
 
     def read(self) -> NDArray[np.uint16]:
         """Return the images."""
@@ -121,9 +141,11 @@ class Played(Stream):
                 for when, rate, force in readings:
                     self._imu.add_angular_rate(when, rate)
                     self._imu.add_specific_force(when, force)
-            depth = np.array(images[self._film.number(k), self._number])  # a copy, as of a camera's buffer
+            image = self._film.number(k)
+            depth = np.array(images[image, self._number])  # a copy, as of a camera's buffer
             yield sv.Frame(
-                depth, self.camera, NOWHERE, stamp_ns, 0.001, name=f"{self.name} {k}", fault="no_pose"
+                depth, self.camera, NOWHERE, stamp_ns, 0.001, name=f"{self.name} {k}", fault="no_pose",
+                photo=self._film.photo(image, self._number),
             )  # fmt: skip
 
 
@@ -240,7 +262,8 @@ def main() -> None:
     way = Way(scene)
     settings = {"voxel_size": wanted.voxel_size, "max_range": wanted.max_range, "threads": wanted.threads}
     with tempfile.TemporaryDirectory(dir=wanted.folder) as folder:
-        film = Film(os.path.join(folder, "film"), round(LOOP_S * wanted.hz) + 1, mounts, way.simulation.camera)
+        film = Film(os.path.join(folder, "film"), round(LOOP_S * wanted.hz) + 1, mounts, way.simulation.camera,
+                    wanted.contrast if tracked else 0.0)  # fmt: skip
         say(f"rendering {film.count} x {wanted.cameras} images of {wanted.width} pixels across ...")
         film.render(way, wanted.hz)
         pipes = [context.Pipe(duplex=False) for _ in mounts]
@@ -300,6 +323,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--hz", type=float, default=30.0, help="images of each camera a second")
     parser.add_argument("--width", type=int, default=848, help="pixels across")
     parser.add_argument("--poses", choices=("udp", "track"), default="udp")
+    parser.add_argument("--contrast", type=float, default=0.3, help="of the pattern in pictures, for --poses track")
     parser.add_argument("--voxel-size", type=float, default=0.1)
     parser.add_argument("--max-range", type=float, default=5.0)
     parser.add_argument("--threads", type=int, default=1)

@@ -3,7 +3,8 @@
 //
 // A function that returns int returns 0, or 1 after an error, which `peer_error` names. One map is used by one thread.
 // A library that takes points has peer_load and peer_insert, one that takes images peer_load_image and
-// peer_insert_image. Only the two `insert` are timed: `load` puts what is given into the library's own types.
+// peer_insert_image, one that takes clouds of a turning lidar peer_load_cloud, peer_insert_cloud and peer_log_odds.
+// Only the `insert` are timed: `load` puts what is given into the library's own types.
 #pragma once
 
 #include <cstdint>
@@ -27,6 +28,13 @@ int peer_insert(void* map);
 // pixel being 0, 0. pose: (4, 4) by rows, the optical frame in the world.
 int peer_load_image(void* map, const float* depth_m, int width, int height, const double* lens, const double* pose);
 int peer_insert_image(void* map);
+
+// points: (count, 3) metres along the lidar's axes, z being that which it turns about. pose: (4, 4) by rows, the lidar in
+// the world. turning: lowest and highest elevation in radians, number of beams above each other and of directions.
+int peer_load_cloud(void* map, const double* points, int64_t count, const double* pose, const double* turning);
+int peer_insert_cloud(void* map);
+// log_odds: (count,), of the cells that points (count, 3) in the world lie in; 0: nothing known.
+int peer_log_odds(void* map, const double* points, int64_t count, float* log_odds);
 
 // Occupied and free cells of the smallest size, and the bytes that the library says it uses.
 int peer_cells(void* map, int64_t* occupied, int64_t* free);

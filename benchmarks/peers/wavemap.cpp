@@ -1,13 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// wavemap's hashed, chunked wavelet octree with the settings of its Python example, one worker thread.
+// wavemap's hashed, chunked wavelet octree, one worker thread; for images with the settings of its Python example, for
+// clouds of a turning lidar with those of its Ouster's configuration.
 #include "peer.h"
 
+#include <algorithm>
+#include <array>
 #include <cmath>
 #include <memory>
 #include <optional>
 
+#include <wavemap/core/integrator/measurement_model/continuous_beam.h>
 #include <wavemap/core/integrator/measurement_model/continuous_ray.h>
 #include <wavemap/core/integrator/projection_model/pinhole_camera_projector.h>
+#include <wavemap/core/integrator/projection_model/spherical_projector.h>
 #include <wavemap/core/integrator/projective/coarse_to_fine/hashed_chunked_wavelet_integrator.h>
 #include <wavemap/core/map/hashed_chunked_wavelet_octree.h>
 
@@ -16,6 +21,8 @@ namespace {
 using namespace wavemap;
 
 constexpr FloatingPoint kNearest = 0.1f;      // nearer ones, and so zeros, have no value for wavemap
+constexpr FloatingPoint kNearestOfLidar = 1.0f;
+constexpr FloatingPoint kBeamSigma = 0.035f * static_cast<FloatingPoint>(M_PI) / 180.0f;
 constexpr FloatingPoint kNoEvidence = 1e-6f;  // log-odds nearer to zero: cells are sums of wavelets
 
 struct Lens {
@@ -27,7 +34,7 @@ struct Lens {
 };
 
 struct Map {
-  Map(double voxel_size, double range) : workers(std::make_shared<ThreadPool>(1)), max_range(range) {
+  Map(double size, double range) : workers(std::make_shared<ThreadPool>(1)), voxel_size(size), max_range(range) {
     HashedChunkedWaveletOctreeConfig config;
     config.min_cell_width = static_cast<FloatingPoint>(voxel_size);
     octree = std::make_shared<HashedChunkedWaveletOctree>(config);
@@ -46,14 +53,40 @@ struct Map {
     integrator.emplace(ProjectiveIntegratorConfig(kNearest, reach), projector, image, offsets, model, octree, workers);
   }
 
+  // The same for clouds of a lidar that turns about z: lowest and highest elevation in radians, rows, columns.
+  void use(const std::array<double, 4>& now) {
+    if (clouds && turning == now) return;
+    turning = now;
+    const CircularProjectorConfig elevation(now[0], now[1], static_cast<IndexElement>(now[2]));
+    const CircularProjectorConfig azimuth(-M_PI, M_PI, static_cast<IndexElement>(now[3]));
+    auto projector = std::make_shared<SphericalProjector>(SphericalProjectorConfig(elevation, azimuth));
+    auto image = std::make_shared<PosedImage<>>(projector->getDimensions());
+    auto offsets = std::make_shared<Image<Vector2D>>(projector->getDimensions());
+    const auto sigma = std::max(static_cast<FloatingPoint>(voxel_size) / 2, 0.05f);  // as its configuration advises
+    auto model = std::make_shared<ContinuousBeam>(ContinuousBeamConfig(kBeamSigma, sigma, 0.2f, 0.4f), projector,
+                                                  image, offsets);
+    const auto reach = static_cast<FloatingPoint>(max_range > 0 ? max_range : 1000);
+    clouds.emplace(ProjectiveIntegratorConfig(kNearestOfLidar, reach), projector, image, offsets, model, octree,
+                   workers);
+  }
+
   HashedChunkedWaveletOctree::Ptr octree;
   std::shared_ptr<ThreadPool> workers;
-  double max_range;
+  double voxel_size, max_range;
+  std::array<double, 4> turning{};
+  std::optional<HashedChunkedWaveletIntegrator> clouds;
+  std::optional<PosedPointcloud<>> given_cloud;
   Lens lens;
   float used_reach = 0;
   std::optional<HashedChunkedWaveletIntegrator> integrator;
   std::optional<PosedImage<>> given;
 };
+
+Transformation3D transform(const double* pose) {
+  const Eigen::Matrix4d T = Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(pose);
+  const Eigen::Quaterniond turn(Eigen::Matrix3d(T.block<3, 3>(0, 0)));
+  return {Rotation3D(turn.normalized().cast<FloatingPoint>()), Point3D(T.block<3, 1>(0, 3).cast<FloatingPoint>())};
+}
 
 }  // namespace
 
@@ -76,17 +109,38 @@ int peer_load_image(void* map, const float* depth_m, int width, int height, cons
     const float reach = self.max_range > 0 ? static_cast<float>(self.max_range) : std::ceil(pixels.maxCoeff());
     self.use({width, height, static_cast<float>(lens[0]), static_cast<float>(lens[1]), static_cast<float>(lens[2]),
               static_cast<float>(lens[3])}, reach);
-    Eigen::Matrix4d T = Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(pose);
-    const Eigen::Quaterniond turn(Eigen::Matrix3d(T.block<3, 3>(0, 0)));
-    const Transformation3D T_W_C(Rotation3D(turn.normalized().cast<FloatingPoint>()),
-                                 Point3D(T.block<3, 1>(0, 3).cast<FloatingPoint>()));
-    self.given.emplace(T_W_C, Image<>::Data(pixels));
+    self.given.emplace(transform(pose), Image<>::Data(pixels));
   });
 }
 
 int peer_insert_image(void* map) {
   auto& self = *static_cast<Map*>(map);
   return peer::guarded([&] { self.integrator->integrate(*self.given); });
+}
+
+int peer_load_cloud(void* map, const double* points, int64_t count, const double* pose, const double* turning) {
+  auto& self = *static_cast<Map*>(map);
+  return peer::guarded([&] {
+    self.use({turning[0], turning[1], turning[2], turning[3]});
+    const Eigen::Map<const Eigen::Matrix<double, 3, Eigen::Dynamic>> given(points, 3, count);
+    self.given_cloud.emplace(transform(pose), Pointcloud<>(given.cast<FloatingPoint>()));
+  });
+}
+
+int peer_insert_cloud(void* map) {
+  auto& self = *static_cast<Map*>(map);
+  return peer::guarded([&] { self.clouds->integrate(*self.given_cloud); });
+}
+
+int peer_log_odds(void* map, const double* points, int64_t count, float* log_odds) {
+  auto& self = *static_cast<Map*>(map);
+  return peer::guarded([&] {
+    for (int64_t k = 0; k < count; ++k, points += 3) {
+      Index3D cell;
+      for (int axis = 0; axis < 3; ++axis) cell[axis] = static_cast<IndexElement>(std::floor(points[axis] / self.voxel_size));
+      log_odds[k] = self.octree->getCellValue(cell);
+    }
+  });
 }
 
 int peer_cells(void* map, int64_t* occupied, int64_t* free) {

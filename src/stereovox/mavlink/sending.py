@@ -121,8 +121,8 @@ class ObstacleSender:
     def _run(self) -> None:
         due = monotonic()
         while not self._stopped.wait(max(due - monotonic(), 0)):
-            self._new.wait(PATIENCE * self._period_s)
             self._new.clear()
+            self._new.wait(PATIENCE * self._period_s)
             if self._stopped.is_set():
                 return
             self._send_or_tell()

@@ -43,6 +43,12 @@ OF_IMAGES: dict[str, tuple[Any, list[Any]]] = {
     "peer_insert_image": (ctypes.c_int, [POINTER]),
 }
 """The same of those that take depth images."""
+OF_CLOUDS: dict[str, tuple[Any, list[Any]]] = {
+    "peer_load_cloud": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER, POINTER]),
+    "peer_insert_cloud": (ctypes.c_int, [POINTER]),
+    "peer_log_odds": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER]),
+}
+"""The same of those that take clouds of a turning lidar."""
 
 
 class NotBuilt(MissingExtra):
@@ -171,9 +177,30 @@ class Ufomap(NativePoints):
 
 
 class WavemapCpp(NativeImages):
-    """wavemap's hashed, chunked wavelet octree with the settings of its Python example."""
+    """wavemap's hashed, chunked wavelet octree: settings of its Python example, for clouds those of its Ouster's."""
 
     name = "wavemap-cpp"
+    functions = NativeImages.functions | OF_CLOUDS
+
+    def prepared_cloud(
+        self, points: NDArray[np.float64], T_world_lidar: NDArray[np.float64], turning: tuple[float, float, int, int]
+    ) -> Callable[[], None]:
+        """Return the call that inserts a cloud; the library has it in its own types by then.
+
+        points: (N, 3) metres along the axes of a lidar that turns about z. turning: lowest and highest elevation in
+        radians, number of beams above each other, number of directions.
+        """
+        points, pose = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(T_world_lidar, np.float64)
+        numbers = np.array(turning, np.float64)
+        given = self._map, _address(points), len(points), _address(pose), _address(numbers)
+        self._check(self._library.peer_load_cloud(*given))
+        return partial(self._call, self._library.peer_insert_cloud)
+
+    def log_odds(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the log-odds (N,) of the cells that points (N, 3) in the world lie in, 0: nothing known."""
+        points, found = np.ascontiguousarray(points, np.float64), np.zeros(len(points), np.float32)
+        self._check(self._library.peer_log_odds(self._map, _address(points), len(points), _address(found)))
+        return found
 
 
 def _load(name: str, functions: tuple[str, ...]) -> ctypes.CDLL:
@@ -191,7 +218,7 @@ def _open(name: str, path: Path, functions: tuple[str, ...]) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path.resolve()))
         for function in functions:
             found = getattr(library, function)
-            found.restype, found.argtypes = (FUNCTIONS | OF_POINTS | OF_IMAGES)[function]
+            found.restype, found.argtypes = (FUNCTIONS | OF_POINTS | OF_IMAGES | OF_CLOUDS)[function]
     except (OSError, AttributeError) as error:
         raise NotBuilt(name, f"{path} cannot be used ({str(error)[:120]})") from None
     return library

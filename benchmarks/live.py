@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import monotonic, sleep, time_ns
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,12 +73,16 @@ class Way:
 class Film:
     """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one way through the loop.
 
-    With a contrast above 0, pictures of the first camera in another, (images, height, width) uint8.
+    With a contrast above 0, pictures of the colour camera beside the first one in another, (images, 480, 640) uint8.
     """
+
+    T_depth_eye = np.eye(4)
+    T_depth_eye[0, 3] = 0.015
 
     def __init__(self, file: str, count: int, mounts: list[Transform], camera: PinholeCamera, contrast: float):
         self.file, self.count, self.mounts, self.camera, self.contrast = file, count, mounts, camera, contrast
         self.shape = count, len(mounts), camera.height, camera.width
+        self.eye = PinholeCamera.from_field_of_view(640, 480, 55.0)  # a D435's colour camera in this mode
 
     def render(self, way: Way, hz: float) -> None:
         """Write all images."""
@@ -93,10 +97,11 @@ class Film:
                 images[k, c] = device.measure(depth.reshape(camera.height, camera.width), [c, k], T)[0]
         images.flush()
         if self.contrast:
-            lens = Lens("pinhole", camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            pictures = np.memmap(self.file + "_grey", np.uint8, "w+", shape=(self.count, camera.height, camera.width))
+            eye = self.eye
+            lens = Lens("pinhole", eye.width, eye.height, eye.fx, eye.fy, eye.cx, eye.cy)
+            pictures = self._pictures("w+")
             for k in range(self.count):
-                T = way.at(k / hz) @ self.mounts[0]
+                T = way.at(k / hz) @ self.mounts[0] @ self.T_depth_eye
                 pictures[k] = photograph(way.simulation.scene, lens, T, GREY_NOISE, [k], self.contrast)
             pictures.flush()
 
@@ -104,8 +109,10 @@ class Film:
         """Return the picture that is taken with image `k` of a camera."""
         if camera or not self.contrast:
             return None
-        shape = self.count, self.camera.height, self.camera.width
-        return sv.Photo(np.array(np.memmap(self.file + "_grey", np.uint8, "r", shape=shape)[k]), self.camera)
+        return sv.Photo(np.array(self._pictures("r")[k]), self.eye, self.T_depth_eye)
+
+    def _pictures(self, mode: Literal["r", "w+"]) -> NDArray[np.uint8]:
+        return np.memmap(f"{self.file}_grey", np.uint8, mode, shape=(self.count, self.eye.height, self.eye.width))
 
     def read(self) -> NDArray[np.uint16]:
         """Return the images."""

@@ -13,7 +13,7 @@ from made_tracks import simulated, track
 from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.track.pairs import DISPARITY
-from stereovox.track.sightings import PIXEL, Corners, Sightings
+from stereovox.track.sightings import ALIKE, PIXEL, Corners, Sightings
 from stereovox.track.tracker import Tracker
 
 DEVIATION = DISPARITY / LENS.fx / BASELINE
@@ -91,6 +91,18 @@ def test_residuals_and_their_derivatives_are_those_of_the_projection():
         covariance = own + corners.variance[k] * np.outer(by_inverse[k], by_inverse[k])
         np.testing.assert_allclose(weight[k] @ covariance, np.eye(3), atol=1e-9)
         assert squares[k] == pytest.approx(off[k] @ np.linalg.solve(covariance, off[k]))
+
+
+@pytest.mark.parametrize("reach", [9.0, 1e2, 1e5])
+def test_equations_are_the_weighted_sums_of_the_residuals(reach):
+    corners, measured, T = some_corners(60, 3)
+    seen = sightings(corners, places(corners, T) + np.random.default_rng(4).normal(0, (2, 2, 0.02), measured.shape))
+    squares, off, weight, by_motion, _ = seen.residuals(T)
+    weight = weight / (ALIKE * (1 + squares / reach) ** 2)[:, None, None]
+    by_all = np.swapaxes(by_motion, 1, 2) @ weight
+    information, gradient = seen.equations(reach)(T)
+    np.testing.assert_allclose(information, (by_all @ by_motion).sum(axis=0), rtol=1e-8)
+    np.testing.assert_allclose(gradient, (by_all @ off[:, :, None]).sum(axis=0)[:, 0], rtol=1e-8)
 
 
 def test_equations_lead_to_the_pose_from_which_the_landmarks_are_seen():

@@ -35,7 +35,7 @@ from stereovox.survey import level_pose
 from stereovox.track.stream import POSE_FAULTS, follow
 from stereovox.track.tracker import Tracked, Tracker
 
-WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 8
+WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 2
 """Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer
 ones; images that wait, for each camera, and for tracking."""
 TICK_S, SOON_S = 0.1, 0.01

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.se3 import Transform, inverse
+from stereovox.track._sightings import equations
 from stereovox.track.fit import Equations
 
 PIXEL = 0.3
@@ -142,10 +143,15 @@ class Sightings:
         return expected @ inverse(T)
 
     def _equations(self, reach: float, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        squares, off, weight, by_motion, _ = self.residuals(T)
-        weight = weight / (ALIKE * (1 + squares / reach) ** 2)[:, None, None]
-        weighted = np.einsum("nik,nij->nkj", by_motion, weight)
-        return np.einsum("nki,nij->kj", weighted, by_motion), np.einsum("nki,ni->k", weighted, off)
+        camera, corners = self.camera, self.corners
+        given = corners.centre, corners.ray, corners.inverse, corners.variance, self.measured, self.deviation
+        information, gradient = np.empty((6, 6)), np.empty(6)
+        equations(
+            *(np.ascontiguousarray(part, np.float64) for part in given),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(),
+            PIXEL, ALIKE, reach, np.empty((6, 3, 6)), information, gradient,
+        )  # fmt: skip
+        return information, gradient
 
     def _variances(self) -> NDArray[np.float64]:
         """Return the variances (N, 3) of what is measured, against what was measured when a landmark was first seen."""

@@ -71,8 +71,10 @@ LIBRARIES = {
             for name in (
                 "config/*",
                 "integrator/integrator_base",
-                "integrator/measurement_model/continuous_ray",
+                "integrator/measurement_model/continuous_*",
+                "integrator/projection_model/circular_projector",
                 "integrator/projection_model/pinhole_camera_projector",
+                "integrator/projection_model/spherical_projector",
                 "integrator/projective/projective_integrator",
                 "integrator/projective/coarse_to_fine/hashed_chunked_wavelet_integrator",
                 "map/map_base",

@@ -85,7 +85,8 @@ struct Map {
 Transformation3D transform(const double* pose) {
   const Eigen::Matrix4d T = Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(pose);
   const Eigen::Quaterniond turn(Eigen::Matrix3d(T.block<3, 3>(0, 0)));
-  return {Rotation3D(turn.normalized().cast<FloatingPoint>()), Point3D(T.block<3, 1>(0, 3).cast<FloatingPoint>())};
+  return Transformation3D(Rotation3D(turn.normalized().cast<FloatingPoint>()),
+                          Point3D(T.block<3, 1>(0, 3).cast<FloatingPoint>()));
 }
 
 }  // namespace
@@ -123,7 +124,8 @@ int peer_load_cloud(void* map, const double* points, int64_t count, const double
   return peer::guarded([&] {
     self.use({turning[0], turning[1], turning[2], turning[3]});
     const Eigen::Map<const Eigen::Matrix<double, 3, Eigen::Dynamic>> given(points, 3, count);
-    self.given_cloud.emplace(transform(pose), Pointcloud<>(given.cast<FloatingPoint>()));
+    Eigen::Matrix<FloatingPoint, 3, Eigen::Dynamic> cloud = given.cast<FloatingPoint>();
+    self.given_cloud.emplace(transform(pose), Pointcloud<>(cloud));
   });
 }
 

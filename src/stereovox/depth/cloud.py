@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
+from stereovox.depth._cloud import usable
 from stereovox.errors import FrameRefused
 from stereovox.frame import CheckedCloud, Cloud, name_of
 from stereovox.se3 import Transform, inverse
@@ -36,24 +37,19 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     if origins is not None and len(origins) != len(points):
         detail = f"{len(origins)} origins of {len(points)} points; give one for each"
         raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
-    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    if origins is not None:
-        measured &= np.isfinite(origins).all(axis=1)
     clear = clear[np.isfinite(clear).all(axis=1)]
-    ends, starts = points[measured], None if origins is None else origins[measured]
-    length = np.linalg.norm(ends if starts is None else ends - starts, axis=1)
-    far = length > cloud.lidar.range_max
-    if far.any():
-        start = 0.0 if starts is None else starts[far]
-        ends[far] = start + (ends[far] - start) * (cloud.lidar.range_max / length[far])[:, None]
-    used = length >= max(cloud.lidar.range_min, config.min_range)
-    if not used.any() and not len(clear):
-        found = f"{len(points)} points, {measured.sum()} of them finite"
+    room = len(points) + len(clear)
+    ends, starts, hits = np.empty((room, 3)), np.empty((room, 3)), np.zeros(room, bool)
+    nearest = max(cloud.lidar.range_min, config.min_range)
+    none = np.empty((0, 3)) if origins is None else origins
+    used, finite = usable(points, none, nearest, float(cloud.lidar.range_max), ends, starts, hits)
+    if not used and not len(clear):
+        found = f"{len(points)} points, {finite} of them finite"
         raise FrameRefused("no_valid_point", f"{name_of(cloud)}: not one ray can be used ({found}); is it covered?")
-    if starts is not None:
-        starts = np.concatenate([starts[used], np.zeros((len(clear), 3))])
-    hits = np.concatenate([~far[used], np.zeros(len(clear), bool)])
-    return CheckedCloud(np.concatenate([ends[used], clear]), starts, hits, cloud.lidar, T, int(cloud.stamp_ns))
+    rays = used + len(clear)
+    ends[used:rays], starts[used:rays], hits[used:rays] = clear, 0.0, False
+    begin = None if origins is None else starts[:rays]
+    return CheckedCloud(ends[:rays], begin, hits[:rays], cloud.lidar, T, int(cloud.stamp_ns))
 
 
 def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transform]) -> Cloud:
@@ -99,4 +95,4 @@ def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
         raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
     if len(given) > MAX_POINTS:
         raise FrameRefused("too_many_points", f"{name_of(cloud)}: {len(given)} {field}; at most {MAX_POINTS} are taken")
-    return given.astype(float)
+    return np.ascontiguousarray(given, float)

@@ -34,6 +34,34 @@ def cast(rays, runs, places, view, table, look_up, lanes, memory, pool_table, co
     return True
 
 
+@kernel
+def lay(ends, hits, of_place, places, R, t, cell, max_range, reach, rays, way):
+    """Write the rays of a cloud one behind the other, as `cast` takes them; return how many say something.
+
+    ends (N, 3): in metres along the sensor's axes; R (3, 3), t (3,): into those that places (P, 3) are on, in cells.
+    hits (N,): whether at a surface. of_place (N,): at which place each begins; (0,): all at the first. reach: metres
+    before a surface up to which a ray beyond the range is free. Written: rays (5, N); way (N,): signs along the axes,
+    and the place.
+    """
+    used = 0
+    for i in range(ends.shape[0]):
+        p = of_place[i] if of_place.shape[0] else 0
+        x, y, z = ends[i, 0], ends[i, 1], ends[i, 2]
+        dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / cell[0] - places[p, 0]
+        dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / cell[1] - places[p, 1]
+        dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]) / cell[2] - places[p, 2]
+        length = np.sqrt((dx * cell[0]) ** 2 + (dy * cell[1]) ** 2 + (dz * cell[2]) ** 2)
+        seen = hits[i] and length <= max_range
+        clear = min(max(length - reach if hits[i] else length, 0.0), max_range)
+        if not (length > 0 and (seen or clear > 0)):
+            continue
+        rays[0, used], rays[1, used], rays[2, used] = dx / length, dy / length, dz / length
+        rays[3, used], rays[4, used] = length if seen else NO_RETURN, clear
+        way[used] = 8 * p + 4 * (dx >= 0) + 2 * (dy >= 0) + (dz >= 0)
+        used += 1
+    return used
+
+
 @cell
 def _aim(rays, position, signs, view, table, lanes):
     """Fill the lanes for a run of rays, in the first cell they cross; those left over go along with the last ray, and

@@ -14,7 +14,6 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import CheckedCloud
 from stereovox.integrate import _cells, _lanes, _points
-from stereovox.integrate._cells import NO_RETURN
 from stereovox.integrate._lanes import LANES
 from stereovox.integrate.ray import make_lanes, make_memory, merged
 from stereovox.integrate.views import MAX_BLOCKS, KernelTable, PerCamera, origin_block, sensor_table
@@ -96,37 +95,25 @@ class Points:
         config, cell = self._config, np.array(self._config.cell)
         R, block = cloud.T_world_sensor[:3, :3], origin_block(cloud.T_world_sensor, config)
         corner = block.astype(float) * SIDE * cell
-        ends = (cloud.ends @ R.T + (cloud.T_world_sensor[:3, 3] - corner)) / cell
         places, of_place = self._places(cloud, R, corner, cell)
-        steps = ends - places[of_place]
-        length = np.linalg.norm(steps * cell, axis=1)
-        surface, clear = self._ends(cloud, length, float(table.reach[-1]))
-        used = (length > 0) & ((surface < NO_RETURN) | (clear > 0))
-        steps, length, of_place = steps[used] / length[used, None], length[used], of_place[used]
-        way = (steps >= 0) @ np.array([4, 2, 1]) + 8 * of_place
-        order = np.argsort(way, kind="stable")
-        rays = np.ascontiguousarray(np.column_stack([steps, surface[used], clear[used]])[order].T, np.float32)
-        return rays, _runs(way[order]), np.ascontiguousarray(places, np.float32)
+        rays, way = np.empty((5, len(cloud.ends)), np.float32), np.empty(len(cloud.ends), np.int64)
+        used = _points.lay(
+            cloud.ends, cloud.hits, of_place, places, np.ascontiguousarray(R), cloud.T_world_sensor[:3, 3] - corner,
+            cell, float(config.max_range), float(table.reach[-1]), rays, way,
+        )  # fmt: skip
+        order = np.argsort(way[:used].astype(np.min_scalar_type(8 * len(places))), kind="stable")  # by radix
+        return np.take(rays, order, axis=1), _runs(way[order]), np.ascontiguousarray(places, np.float32)
 
     def _places(
         self, cloud: CheckedCloud, R: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the places (P, 3) in cells at which rays begin, and which of them each does (N,)."""
+        """Return the places (P, 3) in cells where rays begin, and which of them each does (N,); (0,): there is one."""
         t = cloud.T_world_sensor[:3, 3] - corner
         if cloud.origins is None:
-            return t[None] / cell, np.zeros(len(cloud.ends), np.int64)
+            return t[None] / cell, np.empty(0, np.int64)
         starts = np.rint((cloud.origins @ R.T + t) / cell * PLACES) / PLACES
         places, of_place = np.unique(starts, axis=0, return_inverse=True)
         return places, of_place.reshape(-1)
-
-    def _ends(
-        self, cloud: CheckedCloud, length: NDArray[np.float64], reach: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return how far away the surface of each ray is (NO_RETURN: there is none), and how far it is free then."""
-        max_range = self._config.max_range
-        hits = cloud.hits & (length <= max_range)
-        free = np.where(cloud.hits, length - reach, length)
-        return np.where(hits, length, float(NO_RETURN)), np.clip(free, 0, max_range)
 
     def _is_wide(self, table: KernelTable, places: NDArray[np.float32]) -> bool:
         """Return whether cells need keys of 64 bits. Raises FrameRefused where these do not suffice either."""

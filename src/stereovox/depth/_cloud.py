@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel that picks the rays of a cloud that say something."""
+
+import numpy as np
+
+from stereovox._jit import kernel
+
+
+@kernel
+def usable(points, origins, range_min, range_max, ends, starts, hits):
+    """Write the rays of points (N, 3) that can be used one behind the other; return how many, and how many were finite.
+
+    origins: (N, 3) where each was measured from, (0, 3): all from the sensor. A point at 0, 0, 0 is none. Written, (N,
+    3) each and (N,): where rays end and begin, and whether at a surface: beyond `range_max` they end there without one.
+    """
+    used = finite = 0
+    moving = origins.shape[0] > 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if x == 0 and y == 0 and z == 0:
+            continue
+        a, b, c = (origins[i, 0], origins[i, 1], origins[i, 2]) if moving else (0.0, 0.0, 0.0)
+        dx, dy, dz = x - a, y - b, z - c
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if not np.isfinite(length):
+            continue
+        finite += 1
+        if not length >= range_min:
+            continue
+        far = length > range_max
+        share = range_max / length if far else 1.0
+        ends[used, 0] = a + dx * share if far else x
+        ends[used, 1] = b + dy * share if far else y
+        ends[used, 2] = c + dz * share if far else z
+        starts[used, 0], starts[used, 1], starts[used, 2] = a, b, c
+        hits[used] = not far
+        used += 1
+    return used, finite

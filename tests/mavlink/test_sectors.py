@@ -137,7 +137,7 @@ def test_old_evidence_counts_as_unknown():
     from stereovox import Mapper, open_source
 
     mapper = Mapper("default", voxel_size=0.1, **{"map.keep_times": True})
-    for frame in open_source("sim:room", frames=":40:4"):
+    for frame in open_source("sim:room?image_width=160", frames=":40:4"):
         mapper.add(frame)
     pose, fresh = frame.T_world_sensor, SectorRules(own_radius=0)
     aged = obstacle_sectors(mapper.map, pose, SectorRules(own_radius=0, oldest_s=0.2))

@@ -9,6 +9,7 @@ import pytest
 
 from stereovox import StereovoxError
 from stereovox.errors import MissingExtra
+from stereovox.mavlink import transport
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.transport import open_transport
 
@@ -57,10 +58,11 @@ def test_bytes_go_over_a_serial_port():
     os.close(theirs)
 
 
-def test_a_tcp_connection_that_ends_is_told_once():
+def test_a_tcp_connection_that_ends_is_told_once_and_made_anew(monkeypatch):
+    monkeypatch.setattr(transport, "RETRY_S", 0.05)
     server = socket.create_server(("127.0.0.1", 0))
-    told = []
-    with MavlinkLink(f"tcp:127.0.0.1:{server.getsockname()[1]}", tell=told.append) as link:
+    address, told = server.getsockname(), []
+    with MavlinkLink(f"tcp:127.0.0.1:{address[1]}", tell=told.append) as link:
         peer, _ = server.accept()
         peer.settimeout(30)
         assert peer.recv(100)[0] == 0xFD  # MAVLink 2
@@ -69,8 +71,16 @@ def test_a_tcp_connection_that_ends_is_told_once():
         while not any("cannot read" in line for line in told):
             link._closed.wait(0.01)
         link._closed.wait(0.3)
-    assert sum("cannot read" in line for line in told) == 1
-    assert len(told) <= 2
+        assert sum("cannot read" in line for line in told) == 1
+        assert not any("works again" in line for line in told)
+        server = socket.create_server(address)
+        peer, _ = server.accept()
+        peer.settimeout(30)
+        assert peer.recv(100)[0] == 0xFD
+        while not any("works again" in line for line in told):
+            link._closed.wait(0.01)
+        peer.close()
+        server.close()
 
 
 def test_rubbish_is_passed_over(start_autopilot):

@@ -7,13 +7,15 @@ pymavlink's own connections choose the protocol's version by an environment vari
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from contextlib import suppress
+from time import monotonic
 from typing import Any, Protocol
 
 from stereovox.errors import MissingExtra, StereovoxError
 
 MAX_DATAGRAM = 65536
-CONNECT_S = 5.0
+CONNECT_S, RETRY_S = 2.0, 1.0
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
@@ -40,13 +42,55 @@ def open_transport(url: str) -> Transport:
     if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal():
         raise StereovoxError(f"connection '{url}': give {FORMS}")
     if kind == "serial":
-        return SerialTransport(url, place, int(number))
+        return Reopened(lambda: SerialTransport(url, place, int(number)))
     if not 0 <= int(number) <= 65535:
         raise StereovoxError(f"connection '{url}': {number} is no port; give one up to 65535")
     try:
-        return TcpTransport(place, int(number)) if kind == "tcp" else UdpTransport(kind, place, int(number))
+        if kind == "tcp":
+            return Reopened(lambda: TcpTransport(place, int(number)))
+        return UdpTransport(kind, place, int(number))
     except OSError as error:
         raise StereovoxError(f"connection '{url}': {error}; is the address right, and the port not in use?") from None
+
+
+class Reopened:
+    """A way that breaks, such as a cable that is pulled out, and is then opened anew, tried once a second.
+
+    open: returns the way; what it raises the first time is raised.
+    """
+
+    def __init__(self, open: Callable[[], Transport]):
+        self._open, self._way, self._due_s, self._broken = open, open(), 0.0, False
+
+    def read(self, seconds: float) -> bytes:
+        """Return what came; open the way anew where it broke."""
+        if self._broken:
+            self._way.close()
+            if monotonic() < self._due_s:
+                raise ConnectionError("the connection is gone")
+            self._due_s = monotonic() + RETRY_S
+            self._way, self._broken = self._opened(), False
+        try:
+            return self._way.read(seconds)
+        except OSError:
+            self._broken = True
+            raise
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes."""
+        if self._broken:
+            raise ConnectionError("the connection is gone")
+        self._way.write(data)
+
+    def close(self) -> None:
+        """End the way."""
+        self._way.close()
+
+    def _opened(self) -> Transport:
+        try:
+            return self._open()
+        except StereovoxError as error:
+            raise ConnectionError(str(error)) from None
 
 
 class UdpTransport:

@@ -10,6 +10,7 @@ import pytest
 from made_threads import frames_of
 
 import stereovox as sv
+from made_clouds import room_cloud
 from stereovox.errors import FrameRefused, MapFileError, StereovoxError
 from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection
@@ -125,6 +126,45 @@ def test_corrected_is_as_new(kind, seed, share):
     assert report.all_frames
     assert is_as_new(mapper, moved, **MAPS[kind])
     mapper.close()
+
+
+def made_clouds():
+    """Clouds of all kinds, and depth images of a camera, in order of time."""
+    clouds = [
+        replace(room_cloud(n, 3000), stamp_ns=10**8 * n + 7, sensor="lidar", name=f"cloud {n}") for n in range(12)
+    ]
+    for n in range(0, 12, 3):
+        shifts = np.linspace(0, 0.1, 3000)[:, None] * [1, 0, 0]
+        clouds[n] = replace(clouds[n], points=clouds[n].points.astype(float) + shifts, origins=shifts)
+        clouds[n + 1] = replace(clouds[n + 1], clear=np.float32([[2, 0, 0], [0, 1, 0.5]]), lidar=sv.Lidar(range_max=4))
+    return sorted([*clouds, *frames_of(0, 12)], key=lambda frame: frame.stamp_ns)
+
+
+@pytest.mark.parametrize("kind", ["plain", "int8", "times", "window", "tiles and times", "capped", "two threads"])
+def test_a_map_of_clouds_that_was_saved_is_corrected_as_new(kind, tmp_path):
+    frames, settings = made_clouds(), {**MAPS[kind], "voxel_size": 0.2}
+    first = mapped(frames, **settings)
+    first.save(tmp_path / "m.svox")
+    first.close()
+    again = sv.load_map(tmp_path / "m.svox")
+    kept = {one.stamp_ns: one.frame() for one in again.kept_frames.frames}
+    for cloud in (frame for frame in frames if isinstance(frame, sv.Cloud)):
+        for field in ("points", "origins", "clear"):
+            given, found = getattr(cloud, field), getattr(kept[cloud.stamp_ns], field)
+            assert (given is None) == (found is None)
+            assert given is None or np.array_equal(given, found)
+        assert kept[cloud.stamp_ns].lidar == cloud.lidar
+    mapper = sv.Mapper(again.config, resume=again, tiles=None)
+    moved, poses = shaken(frames, 3, 0.3)
+    assert mapper.correct(poses).moved == len(poses) > 2
+    assert is_as_new(mapper, moved, **settings)
+    mapper.close()
+
+
+def test_loops_of_clouds_are_not_sought_and_that_is_said(tmp_path):
+    mapped(made_clouds(), voxel_size=0.2).save(tmp_path / "m.svox")
+    with pytest.raises(StereovoxError, match=r"cloud 0: loops are sought among depth images.*stereovox remap"):
+        sv.close_loops(tmp_path / "m.svox", tmp_path / "closed.svox")
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -219,7 +219,7 @@ def close(
     if kept is None or not len(kept):
         raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
     frames, closer = kept.frames, LoopCloser(mapper.config, odometry)
-    check_one_way(mapper.map.history)
+    check_one_way(mapper.map.history, frames)
     if positions is not None:
         positions.check(np.array([frame.stamp_ns for frame in frames], np.int64))
     for done, frame in enumerate(frames, 1):

@@ -230,6 +230,10 @@ class Scan:
         return flattened(self.T_world_sensor @ inverse(self.T_base_sensor))
 
 
+MAX_POINTS = 1 << 23
+"""Points of one cloud that are taken."""
+
+
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """The points that a lidar measured in one turn, or any other points that were seen along straight rays.
@@ -303,7 +307,7 @@ class DepthImage:
     @property
     def viewpoint(self) -> Viewpoint:
         """Pose of the camera, and a pinhole for what it saw (of a wide camera, its middle)."""
-        return Viewpoint(self.camera.middle, self.T_world_sensor, self.stamp_ns)
+        return viewpoint_of(self.camera, self.T_world_sensor, self.stamp_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,14 +338,23 @@ class CheckedCloud:
     @property
     def viewpoint(self) -> Viewpoint:
         """Pose of the sensor, as a camera that looks along its x axis."""
-        T = self.T_world_sensor.copy()
-        T[:3, :3] = T[:3, :3] @ R_SENSOR_OPTICAL
-        return Viewpoint(FORWARD, T, self.stamp_ns)
+        return viewpoint_of(self.lidar, self.T_world_sensor, self.stamp_ns)
 
 
 AnyImage = DepthImage | CheckedCloud
 """What integrators turn into evidence."""
 FORWARD = PinholeCamera.from_field_of_view(640, 480, 90)
+
+
+def viewpoint_of(camera: VirtualCamera | Lidar, T_world_sensor: Transform, stamp_ns: int) -> Viewpoint:
+    """Return where a sensor was: a camera's middle one; a lidar as a camera that looks along its x axis."""
+    if not isinstance(camera, Lidar):
+        return Viewpoint(camera.middle, T_world_sensor, stamp_ns)
+    T = T_world_sensor.copy()
+    T[:3, :3] = T[:3, :3] @ R_SENSOR_OPTICAL
+    return Viewpoint(FORWARD, T, stamp_ns)
+
+
 """A camera that stands for a lidar where pictures are drawn from its place."""
 R_SENSOR_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Turns optical axes (x right, y down, z forward) into those of a sensor (x forward, y left, z up)."""

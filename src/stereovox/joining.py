@@ -73,8 +73,8 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
     why = why_added(a, b, np.eye(4))
     if why is not None or a.kept_frames is None or b.kept_frames is None:
         raise StereovoxError(f"where one map lies in the other can be found only by frames, and {why}")
-    for one in (a, b):
-        check_one_way(one.history)
+    check_one_way(a.history, a.kept_frames.frames)
+    check_one_way(b.history, b.kept_frames.frames)
     closers = [_closed(one, words, progress) for one, words in ((a, "first"), (b, "second"))]
     first, second = closers
     place = placed(first, second, lambda done, total: progress(done, total, "finding the second map in the first"))

@@ -16,15 +16,15 @@ from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
 from stereovox.device import check_on_processor, on_usable_device
-from stereovox.errors import ConfigError, FrameRefused, MapFileError
-from stereovox.frame import AnyFrame, Cloud, Frame, Scan, name_of
+from stereovox.errors import ConfigError, MapFileError
+from stereovox.frame import AnyFrame, Cloud, Frame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
 from stereovox.integrate.beams import make_beams
 from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
-from stereovox.maps.kept_frames import Packed, kept_frame
+from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.rebuild import CorrectionReport, FramePoses, as_corrected, correct
 from stereovox.threads import MapLock
@@ -238,20 +238,21 @@ class Mapper:
         """Release what the map holds outside memory: nothing, unless it keeps tiles on disk."""
         self.map.close()
 
-    def _packed(self, frame: Frame | Cloud, passed: Passed) -> Packed | None:
-        """Return the frame's depth image to be kept; None where it is not. FrameRefused `not_kept` for clouds."""
+    def _packed(self, frame: Frame | Cloud, passed: Passed) -> Packed | PackedCloud | None:
+        """Return the frame's depth image or cloud to be kept; None where it is not."""
         kept = self.map.storage.kept
-        if kept is None:
-            return None
-        if isinstance(frame, Cloud):
-            raise FrameRefused("not_kept", f"{name_of(frame)}: clouds cannot be kept; leave map.keep_frames out")
-        return Packed.of(frame) if kept.wants(passed.sensor, passed.seen) else None
+        return packed_of(frame) if kept is not None and kept.wants(passed.sensor, passed.seen) else None
 
     def _keep(
-        self, frame: Frame | Cloud, packed: Packed | None, passed: Passed, quality: str, evidence: Evidence
+        self,
+        frame: Frame | Cloud,
+        packed: Packed | PackedCloud | None,
+        passed: Passed,
+        quality: str,
+        evidence: Evidence,
     ) -> None:
         kept = self.map.storage.kept
-        if kept is not None and packed is not None and isinstance(frame, Frame):
+        if kept is not None and packed is not None:
             kept.keep(kept_frame(frame, packed, self.map.frames, passed.sensor, passed.seen, quality, evidence))
 
 

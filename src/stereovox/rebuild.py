@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import AnyImage, Frame, Viewpoint
+from stereovox.frame import FORWARD, AnyImage, Cloud, Frame, Viewpoint, viewpoint_of
 from stereovox.integrate import Integration
 from stereovox.maps import _pool, make_map
 from stereovox.maps.blocks import CELLS, BlockPool
@@ -79,8 +79,8 @@ class Level(Protocol):
     """A quality level; see `deadline.Quality`."""
 
     @property
-    def prepare(self) -> Callable[[Frame], Prepared]:
-        """Turns a frame into a depth image."""
+    def prepare(self) -> Callable[[Frame | Cloud], Prepared]:
+        """Turns a frame into a checked image or cloud."""
         ...
 
     @property
@@ -149,7 +149,7 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
             sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
             raise StereovoxError(f"{len(found)} frames have the stamp {found[0].stamp_ns} ({sensors}); {cure}")
         frame = found[0]
-        posed = Frame(np.empty((0, 0), np.float32), frame.camera, given[key], name=frame.name)
+        posed = Frame(np.empty((0, 0), np.float32), FORWARD, given[key], name=frame.name)
         rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none
         if not np.array_equal(given[key], frame.T_world_sensor):
             moved[frame.number] = np.array(given[key], float)
@@ -342,7 +342,7 @@ def _other_than(tiles: Path | None, storage: Storage) -> Path | None:
 
 
 def _viewpoint(frame: KeptFrame) -> Viewpoint:
-    return Viewpoint(frame.camera.middle, matrix_of(frame.seen), frame.seen.stamp_ns)
+    return viewpoint_of(frame.camera, matrix_of(frame.seen), frame.seen.stamp_ns)
 
 
 def _is_in(blocks: BlockPool, coords: NDArray[np.int32]) -> NDArray[np.bool_]:

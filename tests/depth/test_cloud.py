@@ -7,39 +7,12 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from made_clouds import HALF, directions_of, pose, room_cloud, room_points
 from stereovox.depth.cloud import checked_cloud, deskewed
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.se3 import inverse, rotation_matrix
+from stereovox.se3 import inverse
 
 CONFIG = sv.load_config()
-HALF = np.array([3.0, 2.0, 1.5])
-"""Half sides of a room in metres."""
-
-
-def room_points(T, directions):
-    """Return where rays (N, 3) from a sensor in the room meet its walls, in the sensor's frame."""
-    rays = directions @ T[:3, :3].T
-    start = T[:3, 3]
-    with np.errstate(divide="ignore"):
-        length = np.min(np.where(rays > 0, HALF - start, -HALF - start) / rays, axis=1)
-    return directions * length[:, None]
-
-
-def directions_of(seed, count=4000):
-    found = np.random.default_rng(seed).normal(size=(count, 3))
-    return found / np.linalg.norm(found, axis=1)[:, None]
-
-
-def pose(x, y=0.0, yaw=0.0):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_matrix([0, 0, yaw]), [x, y, 0.1]
-    return T
-
-
-def room_cloud(n, count=4000, **fields):
-    T = pose(0.1 * n, 0.05 * n, 0.1 * n)
-    points = room_points(T, directions_of(n, count)).astype(np.float32)
-    return sv.Cloud(points, T, 10**8 * n, **fields)
 
 
 def test_a_room_is_mapped_from_clouds():
@@ -133,13 +106,6 @@ def test_what_is_no_cloud_is_refused_and_counted(change, reason):
 def test_too_many_points_are_refused(monkeypatch):
     monkeypatch.setattr("stereovox.depth.cloud.MAX_POINTS", 3)
     assert sv.Mapper().add(sv.Cloud(np.ones((4, 3)), np.eye(4))).refused == "too_many_points"
-
-
-def test_clouds_are_not_kept_and_that_is_said():
-    mapper = sv.Mapper(voxel_size=0.1, **{"map.keep_frames": True})
-    report = mapper.add(room_cloud(0))
-    assert report.refused == "not_kept"
-    assert "map.keep_frames" in report.detail
 
 
 def test_the_same_cloud_from_another_place_is_a_frozen_lidar():

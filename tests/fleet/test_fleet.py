@@ -14,6 +14,7 @@ import pytest
 from made_fleet import SETTINGS, alone, assert_same, recording
 
 import stereovox as sv
+from made_clouds import room_cloud
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings_of
@@ -62,6 +63,19 @@ def test_one_recording_makes_the_map_of_one_mapper(mapped, where):
     assert (made.map.frames, made.map.frames_refused) == (own.frames, own.frames_refused)
     assert made.summary()["recordings"][0]["frames"] == own.frames
     assert sv.load_map(where).overview().counts() == own.counts()
+
+
+def test_clouds_and_depth_images_of_several_machines_make_one_map(mapped, tmp_path):
+    clouds = [room_cloud(n, 3000) for n in range(8)]
+    (tmp_path / "lidar" / "velodyne").mkdir(parents=True)
+    for cloud in clouds:
+        numbers = np.column_stack([cloud.points, np.zeros(len(cloud.points))]).astype(np.float32)
+        numbers.tofile(tmp_path / "lidar" / "velodyne" / f"{cloud.stamp_ns / 1e9:.9f}.bin")
+    poses = np.array([cloud.T_world_sensor for cloud in clouds])
+    write_trajectory(tmp_path / "lidar" / "poses.tum", [cloud.stamp_ns for cloud in clouds], poses, "lidar")
+    both = recording(1), str(tmp_path / "lidar")
+    assert alone(both[1]).frames == len(clouds)
+    assert_same(mapped(both, tmp_path / "m.svox").map.storage.blocks(), of_all(*both))
 
 
 @pytest.mark.parametrize("box_m", [3.2, 4.8, 12.8])

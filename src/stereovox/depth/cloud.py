@@ -12,12 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.depth._cloud import usable
 from stereovox.errors import FrameRefused
-from stereovox.frame import CheckedCloud, Cloud, name_of
+from stereovox.frame import MAX_POINTS, CheckedCloud, Cloud, name_of
 from stereovox.se3 import Transform, inverse
 from stereovox.trust.validate import rigid_pose, validate_fields
 
-MAX_POINTS = 1 << 23
-"""Points of one cloud that are taken."""
 STEPS = 64
 """Poses of a moving sensor during one cloud: between them it moves a few centimetres at most."""
 

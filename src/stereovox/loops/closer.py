@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.loops.drift import GATE, Drift, Way, difference, squared
@@ -386,12 +387,18 @@ class LoopCloser:
         return Edge(first, second, match.T_earlier_later, information(match.covariance))
 
 
-def check_one_way(history: History) -> None:
-    """Raise StereovoxError where a map's frames are not of a single way, so that its loops cannot be sought."""
+def check_one_way(history: History, frames: Sequence[KeptFrame]) -> None:
+    """Raise StereovoxError where a map's frames are not of a single way of cameras, so that no loops can be sought."""
     if history.recordings > 1:
         raise StereovoxError(
             f"the map was merged of {history.recordings} recordings, which are no single way of a camera; close the "
             "loops of each, and merge them with --find"
+        )
+    lidar = next((frame for frame in frames if isinstance(frame.camera, Lidar)), None)
+    if lidar is not None:
+        raise StereovoxError(
+            f"{lidar.name or lidar.sensor}: loops are sought among depth images, and this is a cloud; correct poses of "
+            "clouds by those of another program (stereovox remap)"
         )
 
 

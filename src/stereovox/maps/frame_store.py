@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.errors import StereovoxError
-from stereovox.maps.kept_frames import DTYPES, InFile, KeptFrame, KeptFrames, Packed, digest_of
+from stereovox.frame import MAX_POINTS
+from stereovox.maps.kept_frames import DTYPES, InFile, KeptFrame, KeptFrames, Packed, PackedCloud, digest_of
 from stereovox.safe_io import count_in, json_value, read_bounded
 from stereovox.trust.camera_path import FARTHEST, Seen
 from stereovox.trust.health import FULL
@@ -32,7 +34,7 @@ IN_A_PACK = 64
 """Frames in a file."""
 MAX_INDEX = 1 << 29
 """Bytes of an index; a frame takes less than a kilobyte."""
-CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
+CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera, "lidar": Lidar}
 QUALITIES = (FULL, "near", "coarse")
 MAX_NAME = 4096
 """Letters of a frame's name."""
@@ -142,13 +144,39 @@ def _frame_to(frame: KeptFrame, camera: int) -> dict[str, Any]:
         "farthest": float(frame.farthest) if isfinite(frame.farthest) else None,
         "blocks": frame.blocks.tolist(),
         "dtype": frame.packed.dtype,
-        "depth_bytes": frame.packed.depth_bytes,
+        **_layout(frame.packed),
         "bytes": frame.packed.content.size,
         "digest": frame.packed.digest,
     }
 
 
-def _frames_from(packs: Sequence[Path], saved: Any, cameras: Sequence[VirtualCamera]) -> Iterator[KeptFrame]:
+def _layout(packed: Packed | PackedCloud) -> dict[str, Any]:
+    """Return how the bytes of a frame are shared out."""
+    if isinstance(packed, Packed):
+        return {"depth_bytes": packed.depth_bytes}
+    return {"counts": list(packed.counts), "sizes": list(packed.sizes)}
+
+
+def _packed_from(saved: Any, content: InFile, camera: VirtualCamera | Lidar) -> Packed | PackedCloud:
+    dtype = str(saved["dtype"])
+    if dtype not in DTYPES:
+        raise ValueError("a kept frame is of no kind that is known")
+    if not isinstance(camera, Lidar):
+        depth_bytes = count_in(saved, "depth_bytes")
+        if not depth_bytes <= content.size:
+            raise ValueError("a kept frame is larger than its file")
+        return Packed(dtype, depth_bytes, content, content.digest)
+    counts, sizes = ([int(number) for number in saved[key]] for key in ("counts", "sizes"))
+    if len(counts) != 3 or len(sizes) != 3 or not all(-1 <= count <= MAX_POINTS for count in counts):
+        raise ValueError("a kept cloud has no size that can be")
+    if counts[0] < 0 or min(sizes) < 0 or sum(sizes) != content.size or dtype == "uint16":
+        raise ValueError("a kept cloud does not fill its bytes")
+    return PackedCloud(
+        dtype, (counts[0], counts[1], counts[2]), (sizes[0], sizes[1], sizes[2]), content, content.digest
+    )
+
+
+def _frames_from(packs: Sequence[Path], saved: Any, cameras: Sequence[VirtualCamera | Lidar]) -> Iterator[KeptFrame]:
     if len(saved) > IN_A_PACK * len(packs):
         raise ValueError(f"{len(saved)} kept frames in {len(packs)} packs")
     start, before = 0, -1
@@ -161,22 +189,22 @@ def _frames_from(packs: Sequence[Path], saved: Any, cameras: Sequence[VirtualCam
         yield frame
 
 
-def _frame_from(saved: Any, cameras: Sequence[VirtualCamera], pack: Path, start: int) -> KeptFrame:
-    size, depth_bytes = count_in(saved, "bytes"), count_in(saved, "depth_bytes")
+def _frame_from(saved: Any, cameras: Sequence[VirtualCamera | Lidar], pack: Path, start: int) -> KeptFrame:
+    size = count_in(saved, "bytes")
     stamp_ns, pose = saved["seen"]
     blocks = np.array(saved["blocks"], np.int32)
-    if not depth_bytes <= size or saved["dtype"] not in DTYPES or saved["quality"] not in QUALITIES:
+    if saved["quality"] not in QUALITIES:
         raise ValueError("a kept frame is of no kind that is known")
     if blocks.shape != (2, 3) or len(pose) != 12 or count_in(saved, "camera") >= len(cameras):
         raise ValueError("a kept frame has no place or no camera")
     turn, shift = _numbers(saved.get("pose_sigma", (0, 0)))  # maps from before have none
-    digest = str(saved["digest"])
+    content, camera = InFile((pack, start), size, str(saved["digest"])), cameras[saved["camera"]]
     return KeptFrame(
         count_in(saved, "number"), str(saved["sensor"]), str(saved["name"]), int(saved["stamp_ns"]),
-        np.array(_numbers(saved["T_world_sensor"])).reshape(4, 4), cameras[saved["camera"]],
+        np.array(_numbers(saved["T_world_sensor"])).reshape(4, 4), camera,
         saved["quality"], (abs(turn), abs(shift)), float(saved["depth_scale"]),
         inf if saved["farthest"] is None else float(saved["farthest"]),
-        Packed(saved["dtype"], depth_bytes, InFile((pack, start), size, digest), digest),
+        _packed_from(saved, content, camera),
         Seen(int(stamp_ns), tuple(_numbers(pose))), blocks,
     )  # fmt: skip
 
@@ -188,13 +216,16 @@ def _numbers(saved: Any) -> list[float]:
     return numbers
 
 
-def _camera_to(camera: VirtualCamera) -> dict[str, Any]:
+def _camera_to(camera: VirtualCamera | Lidar) -> dict[str, Any]:
     kind = next(kind for kind, one in CAMERAS.items() if isinstance(camera, one))
-    return {"kind": kind, **asdict(camera)}
+    numbers = asdict(camera)
+    return {"kind": kind, **{key: None if value == inf else value for key, value in numbers.items()}}
 
 
-def _camera_from(saved: Any) -> VirtualCamera:
+def _camera_from(saved: Any) -> VirtualCamera | Lidar:
     numbers = dict(saved)
+    if numbers["kind"] == "lidar" and numbers["range_max"] is None:
+        numbers["range_max"] = inf
     kind = CAMERAS[numbers.pop("kind")]
     correction = numbers.pop("correction", None)
     if correction:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth images of a map's frames, kept without loss and small, so that their poses can be corrected later."""
+"""The depth images and clouds of a map, kept without loss and small, so that their poses can be corrected later."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ import hashlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.errors import MapFileError
-from stereovox.frame import Frame
+from stereovox.frame import Cloud, Frame
 from stereovox.maps import _packing
 from stereovox.maps.evidence import Evidence
 from stereovox.safe_io import zstd_size
@@ -126,6 +128,41 @@ class Packed(NamedTuple):
             raise MapFileError(f"a kept frame is damaged ({error}); make the map anew") from None
 
 
+class PackedCloud(NamedTuple):
+    """A cloud without loss, packed.
+
+    dtype: of its points. counts: how many points, rays without one, and origins it has; -1: it has none of these.
+    sizes: how many bytes belong to each.
+    """
+
+    dtype: str
+    counts: tuple[int, int, int]
+    sizes: tuple[int, int, int]
+    content: Bytes
+    digest: str
+
+    @classmethod
+    def of(cls, cloud: Cloud) -> PackedCloud:
+        """Pack a valid cloud."""
+        given = cloud.points, cloud.clear, cloud.origins
+        dtype = np.result_type(np.float32, *(part.dtype for part in given if part is not None))
+        parts = [b"" if part is None else _packed(np.ascontiguousarray(part, dtype)) for part in given]
+        content, (points, clear, origins) = b"".join(parts), (-1 if part is None else len(part) for part in given)
+        sizes = len(parts[0]), len(parts[1]), len(parts[2])
+        return cls(dtype.name, (points, clear, origins), sizes, InMemory(content), digest_of(content))
+
+    def unpacked(self) -> list[NDArray[Any] | None]:
+        """Return points, clear and origins as they were. Raises MapFileError where they cannot be read."""
+        content, starts = self.content.read(), np.cumsum([0, *self.sizes])
+        try:
+            return [
+                None if count < 0 else _unpacked(content[start : start + size], (count, 3), np.dtype(self.dtype))
+                for count, size, start in zip(self.counts, self.sizes, starts.tolist(), strict=False)
+            ]
+        except (ValueError, RuntimeError) as error:
+            raise MapFileError(f"a kept cloud is damaged ({error}); make the map anew") from None
+
+
 @dataclass(frozen=True, eq=False)
 class KeptFrame:
     """A frame of a map: all that is needed to map it again, from any pose.
@@ -136,12 +173,12 @@ class KeptFrame:
         name: As in `Frame`.
         stamp_ns: As in `Frame`.
         T_world_sensor: (4, 4) float64, as the frame came with it, or as it was corrected.
-        camera: As in `Frame`.
+        camera: As in `Frame`; of a cloud its lidar.
         quality: The quality level that it was mapped at.
         pose_sigma: As in `Frame`.
         depth_scale: As in `Frame`.
         farthest: As in `Frame`.
-        packed: Its depth image.
+        packed: Its depth image, or the cloud.
         seen: Time and exactly rigid pose of the image that was mapped.
         blocks: (2, 3) int32, lowest block it has evidence on and first beyond the highest.
     """
@@ -151,21 +188,33 @@ class KeptFrame:
     name: str
     stamp_ns: int
     T_world_sensor: Transform
-    camera: VirtualCamera
+    camera: VirtualCamera | Lidar
     quality: str
     pose_sigma: tuple[float, float]
     depth_scale: float
     farthest: float
-    packed: Packed
+    packed: Packed | PackedCloud
     seen: Seen
     blocks: NDArray[np.int32]
 
-    def frame(self) -> Frame:
+    def frame(self) -> Frame | Cloud:
         """Return the frame, its photo left out, from its present pose. Raises MapFileError where it cannot be read."""
+        if isinstance(self.camera, Lidar):
+            return self._cloud(self.camera)
+        assert isinstance(self.packed, Packed)
         depth, reason = self.packed.unpacked(self.camera)
         return Frame(
             depth, self.camera, self.T_world_sensor, self.stamp_ns, self.depth_scale, reason, self.name,
             sensor=self.sensor, farthest=self.farthest, pose_sigma=self.pose_sigma,
+        )  # fmt: skip
+
+    def _cloud(self, lidar: Lidar) -> Cloud:
+        assert isinstance(self.packed, PackedCloud)
+        points, clear, origins = self.packed.unpacked()
+        assert points is not None
+        return Cloud(
+            points, self.T_world_sensor, self.stamp_ns, lidar, origins, clear, self.name, sensor=self.sensor,
+            pose_sigma=self.pose_sigma,
         )  # fmt: skip
 
 
@@ -242,15 +291,27 @@ class KeptFrames:
         return kept
 
 
+def packed_of(frame: Frame | Cloud) -> Packed | PackedCloud:
+    """Pack a valid frame."""
+    return PackedCloud.of(frame) if isinstance(frame, Cloud) else Packed.of(frame)
+
+
 def kept_frame(
-    frame: Frame, packed: Packed, number: int, sensor: str, seen: Seen, quality: str, evidence: Evidence
+    frame: Frame | Cloud,
+    packed: Packed | PackedCloud,
+    number: int,
+    sensor: str,
+    seen: Seen,
+    quality: str,
+    evidence: Evidence,
 ) -> KeptFrame:
     """Return a frame to be kept; what the arguments are: as in `KeptFrame`."""
     T_world_sensor = np.array(frame.T_world_sensor, float)
     turn, shift = map(float, frame.pose_sigma)
+    scale, farthest = (1.0, inf) if isinstance(frame, Cloud) else (float(frame.depth_scale), float(frame.farthest))
     return KeptFrame(
-        number, sensor, frame.name, int(frame.stamp_ns), T_world_sensor, frame.camera, quality,
-        (turn, shift), float(frame.depth_scale), float(frame.farthest), packed, seen, blocks_seen(evidence),
+        number, sensor, frame.name, int(frame.stamp_ns), T_world_sensor, frame.camera, quality, (turn, shift), scale,
+        farthest, packed, seen, blocks_seen(evidence),
     )  # fmt: skip
 
 
@@ -268,7 +329,7 @@ def digest_of(content: bytes) -> str:
     return hashlib.blake2b(content, digest_size=12).hexdigest()
 
 
-def _packed(image: NDArray[np.generic]) -> bytes:
+def _packed(image: NDArray[Any]) -> bytes:
     bits = _bits_of(image)
     planes = np.empty((bits.itemsize, *bits.shape), np.uint8)
     _packing.split(bits, planes)

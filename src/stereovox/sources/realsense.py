@@ -91,15 +91,15 @@ class RealSense(Stream):
             _failed(location, error)
         self.name = PREFIX + _serial(self._rs, self._device)
         self.posed = self.options.pose == "fixed"
-        self._motion = self._beside("IMU", self.options.imu, lambda *found: find_motion(*found, self.name))
+        self._motion = self._beside("IMU", self.options.imu, find_motion)
         self._photos = self._beside("colour camera", self.options.photo, find_photos)
 
-    def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any], T | None]) -> T | None:
+    def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any, str], T | None]) -> T | None:
         """Return a sensor that helps to track, None where there is none, or the camera does not say where it is."""
         if self.posed or option == "off":
             return None
         try:
-            return find(self._rs, self._device, self._profile)
+            return find(self._rs, self._device, self._profile, self.name)
         except (RuntimeError, StereovoxError) as error:
             self.notes = (*self.notes, f"{self.name}: its {what} is not used ({' '.join(str(error).split())})")
             return None

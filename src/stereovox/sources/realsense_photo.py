@@ -104,7 +104,7 @@ class PhotoSensor:
                 self._waiting.append((ns_from_ms(image.get_timestamp()), image))
 
 
-def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
+def find_photos(rs: Any, device: Any, depth_profile: Any, _: str) -> PhotoSensor | None:
     """Return the colour camera beside a depth camera, in a mode of its rate; None where there is none.
 
     Raises RuntimeError and StereovoxError where the camera does not say how it sees or where it is.

@@ -67,6 +67,18 @@ int peer_load_image(void* map, const float* depth, int width, int height, const 
   });
 }
 int peer_insert_image(void* map) { return peer::guarded([&] { take(of(map)); }); }
+int peer_load_cloud(void* map, const double* points, int64_t count, const double* pose, const double* turning) {
+  return peer::guarded([&] {
+    Toy& toy = of(map);
+    toy.loaded = count, toy.loaded_far = 0;
+    toy.sum = points[3 * count - 1] + 1000 * pose[7] + 1e6 * turning[3];  // last z, y, directions
+  });
+}
+int peer_insert_cloud(void* map) { return peer::guarded([&] { take(of(map)); }); }
+int peer_log_odds(void* map, const double* points, int64_t count, float* log_odds) {
+  for (int64_t i = 0; i < count; ++i) log_odds[i] = static_cast<float>(points[3 * i + 1]) + of(map).points;
+  return 0;
+}
 int peer_cells(void* map, int64_t* occupied, int64_t* free) {
   *occupied = of(map).points; *free = of(map).far;
   return 0;
@@ -133,6 +145,16 @@ def test_images_lens_and_pose_arrive_as_they_are(built):
     assert peer.bytes() == round(CAMERA.fx + 1000 * CAMERA.cy + 7e6)
     with pytest.raises(StereovoxError, match=r"^wavemap-cpp is compared on pinhole cameras only"):
         peer.insert_image(depth_m, SphericalCamera.from_field_of_view(64, 48, 150, 100), T)
+
+
+def test_clouds_arrive_as_they_are_and_places_are_asked_for(built):
+    peer, T = find_peer("wavemap-cpp")(0.1), np.eye(4)
+    T[1, 3] = 3.0
+    points = np.array([[1.0, 2, 3], [4, 5, 6]], np.float32)
+    peer.prepared_cloud(points, T, (-0.4, 0.1, 64, 2048))()
+    assert peer.counts() == (2, 0)
+    assert peer.bytes() == 6 + 3000 + 2048e6
+    assert peer.log_odds(points).tolist() == [4.0, 7.0]
 
 
 def test_pixels_beyond_the_range_clear_where_they_are_kept(built):

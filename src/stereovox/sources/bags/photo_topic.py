@@ -72,7 +72,7 @@ class PhotoTopic:
         if abs(picture.stamp_ns - stamp_ns) > WITHIN_NS:
             raise FrameRefused("no_photo", f"{self._topic}: no picture within 20 ms of the depth image at {stamp_ns}")
         grey = pixels_of(picture, (self.camera.width, self.camera.height), self._topic)
-        return np.asarray(self._undistort(grey), np.uint8)  # pyright: ignore[reportArgumentType]
+        return self._undistort(grey)
 
 
 def find_photos(file: BagFile, depth: DepthTopic, transforms: Callable[[], Tf | None]) -> PhotoTopic | None:

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.sources.rgbd.depth_files import Depth
+
+Image = TypeVar("Image", bound=NDArray[Any])
 
 NEGLIGIBLE_PX = 0.5
 """Distortion that moves no pixel farther is left as it is."""
@@ -44,10 +45,10 @@ class Undistortion:
         if not moved <= NEGLIGIBLE_PX:
             self._maps, self.moved_px = (columns, rows), moved
 
-    def __call__(self, depth: Depth) -> Depth:
-        """Return the undistorted depth image (height, width), 0 where the distorted one showed nothing."""
+    def __call__(self, image: Image) -> Image:
+        """Return the undistorted image (height, width), 0 where the distorted one showed nothing."""
         if self._maps is None:
-            return depth
+            return image
         import cv2
 
-        return cast("Depth", cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=0))
+        return cast("Image", cv2.remap(image, *self._maps, cv2.INTER_NEAREST, borderValue=0))

@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox import se2
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.frame import Frame, Scan
+from stereovox.frame import Cloud, Frame, Photo, Scan
 from stereovox.localize.amcl.localise import Localiser
 from stereovox.localize.slam.line_map import cloud_of
 from stereovox.localize.slam.loops import ClosureSearch
@@ -23,10 +24,11 @@ from stereovox.sources.tracker import AXES
 from stereovox.track.tracker import Tracker
 
 
-def warm_up(config: Config, tracked: bool = False, localised: bool = False) -> None:
+def warm_up(config: Config, tracked: bool = False, localised: bool = False, clouds: bool = False) -> None:
     """Load or compile all kernels that depth images need under these settings; the map is discarded.
 
-    tracked: those that tracking needs, too; localised: those of localisation by a lidar.
+    tracked: those that tracking needs, too, by depth and by pictures; localised: those of localisation by a lidar;
+    clouds: those of clouds in a 3-D map.
     """
     small = load_config(config, **{"window.outside": "drop"})
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
@@ -48,15 +50,26 @@ def warm_up(config: Config, tracked: bool = False, localised: bool = False) -> N
         mapper = Mapper(small)
         for frame in frames:
             mapper.add(frame)
+        if clouds:
+            mapper.add(Cloud(np.float32([[middle, 0, 0], [0, middle, 0]]), T_world_camera, 9))
         with suppress(StereovoxError):  # a map that is not level has no 2-D map
             LiveProjection(mapper.map).grid()
         mapper.close()
     if tracked:
-        tracker = Tracker(config)
-        for stamp_ns, frame in enumerate([*frames, *frames]):
+        eye = PinholeCamera.from_field_of_view(320, 240, 60.0)
+        tracker, photo = Tracker(config), Photo(_pattern(eye), eye)
+        near = np.full((48, 64), min(middle, config.min_range + 1.0), np.float32)
+        walls = [*frames, *(replace(frames[0], depth=near, photo=photo) for _ in range(4))]
+        for stamp_ns, frame in enumerate([*frames, *walls]):
             tracker.add(replace(frame, stamp_ns=stamp_ns))
     if localised:
         _warm_up_localization(config)
+
+
+def _pattern(camera: PinholeCamera) -> NDArray[np.uint8]:
+    """Return a picture with many corners."""
+    rows, columns = np.indices((camera.height, camera.width)) // 10
+    return np.random.default_rng(0).integers(40, 200, (rows.max() + 1, columns.max() + 1), np.uint8)[rows, columns]
 
 
 def _warm_up_localization(config: Config) -> None:

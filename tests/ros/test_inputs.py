@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages become frames; whatever else they hold, they become a counted refusal and change nothing."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 import wire
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.mapper import GridMapper, Mapper
-from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, ScanInput
+from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, RaysInput, ScanInput
 from stereovox.ros.poses import Pose
 from stereovox.sources.bags.writer_messages import packed_png
+from stereovox.sources.clouds.options import LidarOptions
 
 CAMERA = PinholeCamera(8, 6, 10.0, 10.5, 3.5, 2.5)
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
@@ -127,21 +131,60 @@ def test_a_cloud_marks_its_points_and_clears_up_to_them():
     beside = np.radians(np.arange(-3, 4))
     y, z = 2 * np.tan(np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 2).T)
     points = np.vstack([np.stack([np.full(49, 2.0), y, z], axis=1), [np.nan, 0, 0], [0, 3.0, 0.5]])
-    mapper = Mapper("default", voxel_size=0.1, **{"noise.s0": 0.02})
-    one = CloudInput("/points", 1.0)
+    mapper, one = Mapper("default", voxel_size=0.1), CloudInput("/points", Lidar())
     for stamp in (1, 2):
-        report = mapper.add(one.frame(wire.cloud(points, stamp), lambda *_: Pose(np.eye(4), np.eye(4), 0)))
-        assert report.refused is None
+        cloud = one.frame(wire.cloud(points, stamp), lambda *_: Pose(np.eye(4), np.eye(4), 3))
+        assert (cloud.sensor, cloud.stamp_ns, cloud.pose_off_ns) == ("/points", stamp, 3)
+        assert mapper.add(cloud).refused is None
     occupied = {tuple(np.floor(p / 0.1).astype(int)) for p in mapper.map.occupied()}
     assert any(abs(x - 20) <= 1 and abs(y) <= 1 and abs(z) <= 1 for x, y, z in occupied)
     assert any(abs(x) <= 1 and abs(y - 30) <= 1 and abs(z - 5) <= 1 for x, y, z in occupied)
     assert all(np.nanmin(np.linalg.norm(p - points, axis=1)) < 0.3 for p in mapper.map.occupied())
-    assert mapper.map.state([[1.0, 0.0, 0.0]])[0] == 1
-    assert mapper.map.state([[0.0, 1.0, 0.17]])[0] == 0  # a lone point clears nothing as wide as a cell
+    assert mapper.map.state([[1.0, 0.0, 0.0], [0.0, 1.0, 0.17]]).tolist() == [1, 1]
     assert mapper.map.state([[-1.0, 0.0, 0.0], [2.6, 0.0, 0.0]]).tolist() == [0, 0]  # no point tells of them
 
 
-@pytest.mark.parametrize("make", [lambda: CloudInput("/p", 1.0), lambda: FloorCloudInput("/p")])
+def test_a_cloud_with_times_is_straightened_by_the_poses_of_its_sweep():
+    """The sensor drives along x at 10 m/s towards a wall at 5 m, and measures it all the while."""
+    times = np.linspace(0, 0.125, 50)
+    points = np.column_stack([5 - 10 * times, np.linspace(-1, 1, 50), np.zeros(50), times])
+
+    def driving(frame_id, stamp_ns):
+        place = np.eye(4)
+        place[0, 3] = stamp_ns / 1e8
+        return Pose(place, np.eye(4), 0)
+
+    one = CloudInput("/points", Lidar())
+    asked = []
+    poses = SimpleNamespace(is_final=lambda frame_id, stamp_ns: asked.append(stamp_ns))
+    one.is_final(poses, "lidar", 0)
+    cloud = one.frame(wire.cloud(points, 0, names="xyzt"), driving)
+    np.testing.assert_allclose(cloud.points[:, 0], 5, atol=0.02)
+    np.testing.assert_allclose(cloud.origins[:, 0], 10 * times, atol=0.02)
+    one.is_final(poses, "lidar", 7)
+    assert asked == [0, 7 + 125_000_000]  # the next cloud waits for the poses of a sweep as long
+
+    def unknown_later(frame_id, stamp_ns):
+        if stamp_ns > 50_000_000:
+            raise FrameRefused("no_pose", "not yet")
+        return driving(frame_id, stamp_ns)
+
+    assert one.frame(wire.cloud(points, 0, names="xyzt"), unknown_later).fault == "no_pose"
+
+
+def test_a_scan_enters_a_3d_map_as_rays():
+    told = wire.messages().scan(Scan(np.array([2.0, np.inf, np.nan], np.float32), -0.5, 0.5, 0.1, 5.0, T), "laser")
+    mapper, one = Mapper("default", voxel_size=0.2), RaysInput("/scan", LidarOptions(0.01))
+    for _ in range(2):
+        cloud = one.frame(wire.packed(told), there)
+        assert (len(cloud.points), len(cloud.clear), cloud.lidar.sigma, cloud.lidar.range_max) == (1, 1, 0.01, 5.0)
+        assert mapper.add(cloud).refused in (None, "repeated_stamp")
+    ahead = T[:3, 3] + [[4.0, 0, 0], [1.2 * np.cos(-0.5), 1.2 * np.sin(-0.5), 0]]
+    assert mapper.map.state(ahead).tolist() == [1, 1]
+    assert RaysInput("/scan", LidarOptions()).frame(b"\0\1\0\0", there).fault == "unreadable"
+
+
+@pytest.mark.parametrize("make", [lambda: CloudInput("/p", Lidar()), lambda: FloorCloudInput("/p")])
 @pytest.mark.parametrize(
     "changes",
     [
@@ -160,7 +203,8 @@ def test_hostile_clouds_are_refused(make, changes):
 
 def test_empty_clouds_and_clouds_of_nan_are_refused():
     for points in (np.empty((0, 3)), np.full((5, 3), np.nan)):
-        assert Mapper("default").add(CloudInput("/p", 1.0).frame(wire.cloud(points), there)).refused == "no_valid_depth"
+        cloud = CloudInput("/p", Lidar()).frame(wire.cloud(points), there)
+        assert Mapper("default").add(cloud).refused == "no_valid_point"
 
 
 def test_a_scan_comes_with_where_it_sits():

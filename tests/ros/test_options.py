@@ -42,7 +42,8 @@ def test_parameters_come_as_ros_has_them():
         ({"wait_s": -1.0}, r"ros\.wait_s"),
         ({"map_rate": 0.0}, r"ros\.map_rate"),
         ({"low": 1.0}, r"ros\.high"),
-        ({"cloud_step_deg": 0.0}, r"ros\.cloud_step_deg"),
+        ({"lidar_sigma": -1.0}, r"sigma -1"),
+        ({"lidar_min": 5.0, "lidar_max": 4.0}, r"ranges from 5 to 4 m"),
         ({"pose": "/vicon/camera"}, r"ros\.pose '/vicon/camera': write TOPIC=FRAME"),
     ],
 )
@@ -51,12 +52,10 @@ def test_parameters_that_cannot_be_are_told(given, said):
         with_parameters(Options(), given)
 
 
-def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
+def test_something_must_be_mapped():
     with pytest.raises(StereovoxError, match="--depth"):
-        Options().check_sources(3)
-    with pytest.raises(StereovoxError, match="dimensions=2"):
-        Options(scan=("/scan",)).check_sources(3)
-    Options(scan=("/scan",)).check_sources(2)
+        Options().check_sources()
+    Options(scan=("/scan",)).check_sources()
 
 
 @pytest.mark.parametrize(
@@ -69,7 +68,6 @@ def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
         (["--ros-args", "-p", "ros.dept:=/a"], "ros.depth"),
         (["--depth", DEPTH, "--ros-args", "--nonsense"], "--ros-args"),
         (["--depth", DEPTH, "--out", "/proc/x/y"], "/proc"),
-        (["--scan", "/scan"], "dimensions=2"),
         ([], "--depth"),
         (["--cloud", "/lidar", "--poses", "track"], "--poses track"),
         (["--depth", DEPTH, "--odometry", "/odom", "--poses", "track"], "--odometry /odom"),

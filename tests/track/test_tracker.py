@@ -121,6 +121,14 @@ def test_frames_of_another_sensor_are_lost_and_disturb_nothing():
         assert np.array_equal(one.T_world_sensor, both.T_world_sensor)
 
 
+def test_before_a_board_that_fills_the_view_it_is_lost():
+    """All of it stands where the image before saw free space, so that nothing is left to be laid onto that."""
+    first = at_even_times(frames("room")[:1])[0]
+    flat = [np.full_like(first.depth, round(metres / first.depth_scale)) for metres in (2.5, 1.0, 1.0)]
+    found = track([replace(first, depth=depth, stamp_ns=k * STEP_NS) for k, depth in enumerate(flat)])
+    assert found.lost == [0, 1, 2]
+
+
 def test_behind_a_finger_it_is_lost_and_found_again_where_it_is():
     taken = frames("apartment")
     found = track([*taken[:6], *map(covered, taken[6:11]), *taken[11:]])

@@ -36,7 +36,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     topics = (
         ("depth", "TOPIC[=INFO]", "depth images (16UC1, 32FC1, .../compressedDepth), and their camera_info"),
         ("cloud", "TOPIC", "point clouds"),
-        ("scan", "TOPIC", "laser scans, for a floor map (--set dimensions=2)"),
+        ("scan", "TOPIC", "laser scans"),
         ("odometry", "TOPIC", "poses as nav_msgs/Odometry, besides /tf"),
         ("pose", "TOPIC=FRAME", "poses of a frame as geometry_msgs/PoseStamped"),
         ("fixed", "TEXT", "fixed pose of a frame: 'PARENT CHILD x y z yaw pitch roll'"),
@@ -166,13 +166,13 @@ def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping
     from stereovox.warm_up import warm_up
 
     config, options = _settings(arguments, node)
-    options.check_sources(config.dimensions)
+    options.check_sources()
     check_corrections(options, config)
     _reserve(options.out, config.dimensions, stack)
     if options.slam_out:
         _reserve(options.slam_out, 2, stack)
     say_about_compiling()
-    warm_up(config, options.poses == TRACK, options.localised)
+    warm_up(config, options.poses == TRACK, options.localised, bool(options.cloud or options.scan))
     tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
     mapping = Mapping(config, options.heights, tiles)
     stack.callback(mapping.close)

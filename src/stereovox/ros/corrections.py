@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.corrected_poses import SLIGHT, OdometryJumps, noticeable, poses_by_path
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Frame
+from stereovox.frame import Cloud, Frame
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.rebuild import FrameKey
 from stereovox.ros.inputs import Input, header
@@ -34,7 +34,7 @@ AGAIN_S = 10.0
 class Corrector(Protocol):
     """Notes the frames of the map, and asks for corrections."""
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
         """Take note of a frame that has a pose. frame_id: the frame that its message is in."""
         ...
 
@@ -59,13 +59,13 @@ class PathCorrections:
 
     def __init__(self, mapping: Mapping, poses: PoseBuffer, options: Options, log: Any):
         self.topic, self._body = options.corrected_path, frame_name(options.path_frame)
-        self._first = next((split_pair(text)[0] for text in (*options.depth, *options.cloud)), "")
+        self._first = next((split_pair(text)[0] for text in (*options.depth, *options.cloud, *options.scan)), "")
         self._mapping, self._poses, self._log = mapping, poses, log
-        self._sensors: dict[str, tuple[str, Transform]] = {}
+        self._sensors: dict[str, str] = {}
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
         """Remember which frame the messages of a topic are in."""
-        self._sensors[sensor.topic] = frame_id, sensor.T_frame_sensor
+        self._sensors[sensor.topic] = frame_id
         if sensor.topic == self._first and not self._body:
             self._body = frame_id
 
@@ -93,10 +93,10 @@ class PathCorrections:
         if frame_id not in ("", world):
             raise StereovoxError(f"it is in frame {frame_id}, the map in {world}; give --world-frame {frame_id}")
         mounts = {}
-        for topic, (sensor, T_frame_sensor) in self._sensors.items():
-            T_body_frame = self._fixed(body, sensor)
-            if T_body_frame is not None:
-                mounts[topic] = T_body_frame @ T_frame_sensor
+        for topic, sensor in self._sensors.items():
+            T_body_sensor = self._fixed(body, sensor)
+            if T_body_sensor is not None:
+                mounts[topic] = T_body_sensor
         if not mounts:
             raise StereovoxError(
                 f"no fixed transform from {body} to a sensor; publish it on /tf_static or give --fixed"
@@ -123,10 +123,10 @@ class JumpCorrections:
         self._mapping, self._poses, self._odom, self._log = mapping, poses, frame_name(odom), log
         self._jumps = OdometryJumps(min(mapping.config.cell), mapping.config.max_range)
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
         """Ask for a correction where a frame shows that a jump has come to its end."""
         try:
-            T_odom_sensor = self._place(frame_id, frame.stamp_ns) @ sensor.T_frame_sensor
+            T_odom_sensor = self._place(frame_id, frame.stamp_ns)
         except FrameRefused as error:
             self._log.warning(f"jumps are not noticed: {error}", throttle_duration_sec=AGAIN_S)
             return

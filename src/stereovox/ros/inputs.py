@@ -9,29 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.cameras.wide import WIDEST_DEG, SphericalCamera
-from stereovox.depth.sphere.image import T_BODY_GRID
-from stereovox.depth.sphere.layout import SphereLayout
+from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Frame, Reason, Scan
+from stereovox.frame import Cloud, Frame, Scan
 from stereovox.ros.poses import Pose, PoseBuffer
-from stereovox.se3 import Transform, inverse
+from stereovox.se3 import inverse
 from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
-from stereovox.sources.bags.robot_messages import PointCloud, frame_name, read_laser_scan, read_point_cloud
+from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud
+from stereovox.sources.clouds.bag import cloud_of_scan
+from stereovox.sources.clouds.options import LidarOptions
 from stereovox.sources.poses import seconds_from_ns
 from stereovox.sources.robots.bag import posed_scan
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 
-EXACT = 1e-6
-"""Disparity error in pixels of a lidar, practically zero: only the settings under `noise` count."""
+LONGEST_SWEEP_S = 0.5
+"""Seconds of a turn of a lidar; clouds whose points have later times do not wait for their poses."""
 NO_POSE = np.full((4, 4), np.nan)
 NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
 COMPRESSED = "/compressedDepth"
@@ -39,50 +38,14 @@ PoseLookup = Callable[[str, int], Pose]
 """Returns the pose of a frame (by its name) at a time in nanoseconds; raises FrameRefused."""
 
 
-def frame_of_cloud(cloud: PointCloud, T_world_sensor: Transform, step_deg: float, name: str, sensor: str) -> Frame:
-    """Return a cloud as the frame of a spherical camera where its sensor stands (x forward, y left, z up).
-
-    A pixel is `step_deg` wide in azimuth and elevation and has the distance of the nearest of its points from the
-    sensor's z axis. One without points is masked, and clears nothing: a cloud does not tell where it looked. Points
-    within two degrees of the z axis have no such depth and are left out.
-    """
-    camera, columns, layout = _eye(step_deg)
-    points = cloud.points[np.isfinite(cloud.points).all(axis=1)].astype(float)
-    cells = layout.cells_of(points)
-    level = np.hypot(points[:, 0], points[:, 1])
-    seen = (cells >= 0) & (level > 0)
-    depth = np.full(layout.azimuths * layout.polars, np.inf)
-    np.minimum.at(depth, cells[seen], level[seen])
-    depth[np.isinf(depth)] = np.nan
-    image = depth.reshape(layout.shape)[:, columns].astype(np.float32)
-    reason = np.where(np.isnan(image), np.uint8(Reason.MASKED), np.uint8(Reason.VALID))
-    return Frame(image, camera, T_world_sensor @ T_BODY_GRID, cloud.stamp_ns, reason=reason, name=name, sensor=sensor)
-
-
-@lru_cache(maxsize=4)
-def _eye(step_deg: float) -> tuple[SphericalCamera, NDArray[np.int64], SphereLayout]:
-    """Return the camera, which polar cells of the layout are its columns, and the layout of all directions."""
-    half_turn = max(round(180 / step_deg), 18)
-    layout = SphereLayout(half_turn, 0, 0, half_turn, 2 * half_turn)
-    step = layout.step
-    columns = np.flatnonzero(np.abs(layout.polar() - np.pi / 2) <= np.radians(WIDEST_DEG) - 1e-9)
-    rows, width = layout.azimuths, len(columns)
-    camera = SphericalCamera(
-        width, rows, step, step, (width - 1) / 2, -(layout.azimuth()[0]) / step, baseline=1.0, subpixel=EXACT
-    )
-    return camera, columns, layout
-
-
 class Input(Protocol):
     """Input topic of the map.
 
-    kind: its message type as `package/Name`. T_frame_sensor: (4, 4), the axes of its frames' sensor in the frame that
-    its messages are in.
+    kind: its message type as `package/Name`.
     """
 
     topic: str
     kind: str
-    T_frame_sensor: Transform = np.eye(4)
 
     @property
     def ready(self) -> bool:
@@ -93,7 +56,7 @@ class Input(Protocol):
         """Return whether no later message can change the pose of a message."""
         return poses.is_final(frame_id, stamp_ns)
 
-    def frame(self, data: bytes, where: PoseLookup) -> Frame | Scan | None:
+    def frame(self, data: bytes, where: PoseLookup) -> Frame | Cloud | Scan | None:
         """Convert a message; the `fault` of the result says why it cannot be used. None: it is not to be mapped."""
         ...
 
@@ -150,25 +113,50 @@ class DepthInput(Input):
 
 
 class CloudInput(Input):
-    """Point clouds for a 3-D map; see `frame_of_cloud`."""
+    """Point clouds for a 3-D map, a ray for each point. Where points have times, poses of the sweep straighten it.
+
+    lidar: what their ranges can be trusted for.
+    """
 
     kind = "sensor_msgs/PointCloud2"
-    T_frame_sensor = T_BODY_GRID
 
-    def __init__(self, topic: str, step_deg: float):
-        self.topic, self._step_deg = topic, step_deg
+    def __init__(self, topic: str, lidar: Lidar):
+        self.topic, self._lidar, self._sweep_ns = topic, lidar, 0
 
-    def frame(self, data: bytes, where: PoseLookup) -> Frame:
-        """Convert a cloud to a spherical depth image."""
+    def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
+        """Return whether no later message can change a pose of a cloud's sweep, if it is as long as the one before."""
+        return poses.is_final(frame_id, stamp_ns + self._sweep_ns)
+
+    def frame(self, data: bytes, where: PoseLookup) -> Cloud:
+        """Convert a cloud."""
         try:
             cloud = read_point_cloud(Wire(data, cdr=True))
-            name = _frame_title(self.topic, cloud.stamp_ns)
-            T_world_sensor, _, off_ns = where(frame_name(cloud.frame_id), cloud.stamp_ns)
-            frame = frame_of_cloud(cloud, T_world_sensor, self._step_deg, name, self.topic)
+            frame_id = frame_name(cloud.frame_id)
+            found = _cloud_at(Cloud(cloud.points, NO_POSE, cloud.stamp_ns, self._lidar), self.topic, where, frame_id)
+            if cloud.times_s is None:
+                return found
+            last_s = float(np.max(cloud.times_s, initial=0.0, where=np.isfinite(cloud.times_s)))
+            self._sweep_ns = round(1e9 * last_s) if last_s <= LONGEST_SWEEP_S else 0
+            return deskewed(found, cloud.times_s, lambda stamp_ns: where(frame_id, stamp_ns).T_world_sensor)
         except (FrameRefused, ValueError) as error:
-            blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NO_POSE, name=self.topic, sensor=self.topic)
-            return replace(blank, **_fault(error, self.topic))
-        return replace(frame, pose_off_ns=off_ns)
+            return _no_cloud(self.topic, error)
+
+
+class RaysInput(Input):
+    """Scans of a 2-D lidar for a 3-D map, a ray for each beam. options: what their ranges can be trusted for."""
+
+    kind = "sensor_msgs/LaserScan"
+
+    def __init__(self, topic: str, options: LidarOptions):
+        self.topic, self._options = topic, options
+
+    def frame(self, data: bytes, where: PoseLookup) -> Cloud:
+        """Convert a laser scan."""
+        try:
+            scan = read_laser_scan(Wire(data, cdr=True))
+            return _cloud_at(cloud_of_scan(scan, self._options), self.topic, where, frame_name(scan.frame_id))
+        except (FrameRefused, StereovoxError, ValueError) as error:
+            return _no_cloud(self.topic, error)
 
 
 class FloorCloudInput(Input):
@@ -213,6 +201,17 @@ class ScanInput(Input):
             return _no_scan(self.topic, error)
         scan = posed_scan(scan_message, T_world, T_base, _frame_title(self.topic, scan_message.stamp_ns), off_ns)
         return replace(scan, sensor=self.topic)
+
+
+def _cloud_at(cloud: Cloud, topic: str, where: PoseLookup, frame_id: str) -> Cloud:
+    """Return a cloud from where its sensor was. Raises FrameRefused."""
+    T_world_sensor, _, off_ns = where(frame_id, cloud.stamp_ns)
+    name = _frame_title(topic, cloud.stamp_ns)
+    return replace(cloud, T_world_sensor=T_world_sensor, pose_off_ns=off_ns, name=name, sensor=topic)
+
+
+def _no_cloud(topic: str, error: Exception) -> Cloud:
+    return Cloud(np.empty((0, 3), np.float32), NO_POSE, name=topic, sensor=topic, **_fault(error, topic))
 
 
 def _no_scan(topic: str, error: Exception) -> Scan:

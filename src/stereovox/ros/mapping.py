@@ -11,7 +11,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.formats.map_server import read_map_server
-from stereovox.frame import Frame, Scan, UpdateReport
+from stereovox.frame import Cloud, Frame, Scan, UpdateReport
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.kept_frames import KeptFrame
@@ -57,7 +57,7 @@ class Mapping:
         """History of the map's frames."""
         return self.mapper.map.history
 
-    def add(self, frame: Frame | Scan) -> UpdateReport:
+    def add(self, frame: Frame | Cloud | Scan) -> UpdateReport:
         """Add a frame or scan to the map."""
         return self.mapper.add(frame)
 

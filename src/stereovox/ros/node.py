@@ -14,7 +14,7 @@ from time import monotonic_ns
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.frame import Frame, UpdateReport
+from stereovox.frame import Cloud, Frame, UpdateReport
 from stereovox.rebuild import CorrectionReport
 from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
 from stereovox.ros.inputs import header
@@ -156,7 +156,7 @@ class MapNode:
             return
         report = self._mapping.add(frame)
         self._on_report(report)
-        if self._corrector is not None and isinstance(frame, Frame) and not frame.fault:
+        if self._corrector is not None and isinstance(frame, Frame | Cloud) and not frame.fault:
             self._corrector.seen(sensor, one.frame_id, frame, not report.refused)
         if report.refused:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)

@@ -14,10 +14,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from stereovox.cameras.lidar import USUAL_SIGMA_M
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.localize.robot_track import parse_start
 from stereovox.pose_choice import GIVEN, TRACK
 from stereovox.safe_io import FLOOR_READABLE
+from stereovox.sources.clouds.options import LidarOptions
 
 PREFIX = "ros."
 """Prefix of the parameters that are options of the node."""
@@ -52,7 +54,9 @@ class Options:
     OctoMap, and of obstacles and free rays. obstacle_range: metres round the robot in which those are; blind_m: metres
     up to which unknown cells do not end a free ray.
     low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
-    full_octomap: publish log-odds, not only occupied and free. cloud_step_deg: see `inputs.frame_of_cloud`.
+    full_octomap: publish log-odds, not only occupied and free.
+    lidar_sigma: standard deviation of the ranges of clouds and scans in metres. lidar_min, lidar_max: metres below
+    which their points are left out, and beyond which they are no surfaces (0: no limit).
     corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: whose poses they are; "":
     that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the way since the last one.
     reliable: request reliable delivery of images. out: where the map is saved; "": nowhere.
@@ -86,7 +90,9 @@ class Options:
     low: float = math.nan
     high: float = math.nan
     full_octomap: bool = False
-    cloud_step_deg: float = 1.0
+    lidar_sigma: float = USUAL_SIGMA_M
+    lidar_min: float = 0.5
+    lidar_max: float = 0.0
     corrected_path: str = ""
     path_frame: str = ""
     correct_jumps: bool = False
@@ -113,8 +119,7 @@ class Options:
             raise StereovoxError(f"{PREFIX}blind_m {self.blind_m:g}: give metres, 0 to ros.obstacle_range")
         if not 1 <= self.queue <= 1000:
             raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
-        if not 0.05 <= self.cloud_step_deg <= 10:
-            raise StereovoxError(f"{PREFIX}cloud_step_deg {self.cloud_step_deg:g}: give 0.05 to 10 degrees")
+        self.ranges.lidar  # noqa: B018 - its numbers are checked
         if lacking := [text for text in self.pose if not all(split_pair(text))]:
             raise StereovoxError(f"{PREFIX}pose '{lacking[0]}': write TOPIC=FRAME, the frame whose pose it is")
         if math.isnan(self.low) != math.isnan(self.high) or self.low >= self.high:
@@ -126,6 +131,11 @@ class Options:
         return None if math.isnan(self.low) else (self.low, self.high)
 
     @property
+    def ranges(self) -> LidarOptions:
+        """What the ranges of clouds and scans can be trusted for."""
+        return LidarOptions(self.lidar_sigma, self.lidar_min, self.lidar_max)
+
+    @property
     def floor(self) -> str:
         """File of the map that the robot is localised in; "": none."""
         return self.poses if Path(self.poses).suffix.lower() in FLOOR_READABLE else ""
@@ -135,8 +145,8 @@ class Options:
         """Whether the robot is localised by its lidar."""
         return self.poses == SLAM or bool(self.floor)
 
-    def check_sources(self, dimensions: int) -> Options:
-        """Return these options; raises StereovoxError for no input topic or one that this kind of map cannot use."""
+    def check_sources(self) -> Options:
+        """Return these options; raises StereovoxError for no input topic or one that cannot be used with others."""
         if not (self.depth or self.cloud or self.scan or (self.localised and self.lidar)):
             raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
         if self.poses == TRACK and not self.depth:
@@ -146,10 +156,6 @@ class Options:
             topic = (self.odometry or self.pose)[0]
             raise StereovoxError(f"{given} {topic}: is not used with --poses track; leave one of them out")
         self._check_localisation()
-        if self.scan and dimensions == 3:
-            raise StereovoxError(
-                f"--scan {self.scan[0]}: a 2-D lidar maps a floor; add --set dimensions=2 or --profile ist2019"
-            )
         return self
 
     def _check_localisation(self) -> None:

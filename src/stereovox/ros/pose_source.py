@@ -13,7 +13,7 @@ from stereovox.formats.map_server import read_map_server
 from stereovox.localize.robot_track import doubt_lines, parse_start, refused_line
 from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.pose_choice import GIVEN, TRACK
-from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput
+from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, RaysInput, ScanInput
 from stereovox.ros.localization import (
     LocalizedPoses,
     Localizer,
@@ -171,10 +171,11 @@ def pose_source(node: Any, config: Config, options: Options) -> PoseSource:
 
 def inputs_of(options: Options, dimensions: int) -> list[Input]:
     """Return the topics to map."""
-    clouds = [FloorCloudInput(topic) if dimensions == 2 else CloudInput(topic, options.cloud_step_deg)
-              for topic in options.cloud]  # fmt: skip
     depth = [DepthInput(*split_pair(text)) for text in options.depth]
-    return [*depth, *clouds, *map(ScanInput, options.scan)]
+    if dimensions == 2:
+        return [*depth, *map(FloorCloudInput, options.cloud), *map(ScanInput, options.scan)]
+    clouds = [CloudInput(topic, options.ranges.lidar) for topic in options.cloud]
+    return [*depth, *clouds, *(RaysInput(topic, options.ranges) for topic in options.scan)]
 
 
 def _figures(result: SlamResult) -> dict[str, Any]:

@@ -186,7 +186,7 @@ class Level:
     @property
     def known(self) -> float:
         """Share of the patches that had a surfel."""
-        return len(self.ratios) / len(self.seen.points)
+        return len(self.ratios) / max(len(self.seen.points), 1)
 
     @property
     def usual(self) -> float:

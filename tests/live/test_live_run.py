@@ -236,8 +236,9 @@ def test_the_distances_all_round_are_those_of_all_cameras(tmp_path):
     assert now_ns == grid.stamp_ns.max()
 
 
-def test_a_tracked_camera_moves_the_others(tmp_path):
+def test_a_tracked_camera_moves_the_others(tmp_path, monkeypatch):
     """The second camera has no poses: it looks back from a mount, and sees its wall behind."""
+    monkeypatch.setattr("stereovox.live.stream.UNTRACKED", 40)  # a busy machine drops none
     keeper = Keeper()
     front = Paced(open_source("sim:room?image_width=212", frames=":12"))
     behind = LiveCamera(Images("b", 30, 1 / 30, distance_m=1.0), "back", mount_of([-0.1, 0, 0, 0, 0, 180]))

@@ -211,7 +211,8 @@ def _cloud_at(cloud: Cloud, topic: str, where: PoseLookup, frame_id: str) -> Clo
 
 
 def _no_cloud(topic: str, error: Exception) -> Cloud:
-    return Cloud(np.empty((0, 3), np.float32), NO_POSE, name=topic, sensor=topic, **_fault(error, topic))
+    blank = Cloud(np.empty((0, 3), np.float32), NO_POSE, name=topic, sensor=topic)
+    return replace(blank, **_fault(error, topic))
 
 
 def _no_scan(topic: str, error: Exception) -> Scan:

@@ -178,7 +178,8 @@ class Noted:
         done, age = np.array(self._mapped).reshape(-1, 2).T
         at, since = np.array(came).reshape(-1, 2).T
         image = np.searchsorted(done, since, "right")  # the first that was mapped after that began
-        at, image = at[image < len(done)], image[image < len(done)]
+        in_flight = (image < len(done)) & (at < done[-1] + 0.05)  # not those that are repeated after the last image
+        at, image = at[in_flight], image[in_flight]
         return (1e3 * (at - done[image] + age[image])).tolist()
 
 

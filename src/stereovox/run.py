@@ -347,7 +347,7 @@ class MapRun:
         if self.poses == TRACK:
             found = replace(found, up=None)  # which is that of the recording's own poses
         settings = found.settings if self._profile is None else found.up_settings
-        chosen, lines = settings(self._overrides)
+        chosen, lines = settings(self._overrides, not self._level)
         if self._level and found.up is not None and found.up.sure:
             chosen.setdefault("up", found.up.axis)  # where it is z, nothing had to be chosen
         return chosen, lines

@@ -127,17 +127,18 @@ class Survey:
     voxel_size: Suggestion
     notes: tuple[str, ...]
 
-    def settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    def settings(self, given: Mapping[str, Any], can_level: bool = True) -> tuple[dict[str, Any], list[str]]:
         """Choose the settings that the recording itself suggests.
 
         Args:
             given: Settings that the user chose, which are kept.
+            can_level: Whether the lines may say that `--level` turns the map upright.
 
         Returns:
             Settings by name, and lines that say which, why, and how to override them.
         """
         chosen, lines = self._size_settings(given)
-        up, said = self.up_settings(given)
+        up, said = self.up_settings(given, can_level)
         return {**chosen, **up}, [*lines, *said]
 
     def _size_settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -158,11 +159,12 @@ class Survey:
         why = self.max_range.why if "max_range" in chosen else cell.why
         return chosen, [f"{what} ({why}); else give {' or '.join(options[name] for name in chosen)}"]
 
-    def up_settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    def up_settings(self, given: Mapping[str, Any], can_level: bool = True) -> tuple[dict[str, Any], list[str]]:
         """Choose which way is up.
 
         Args:
             given: Settings that the user chose, which are kept.
+            can_level: As for `settings`.
 
         Returns:
             As `settings`, about up alone.
@@ -177,7 +179,7 @@ class Survey:
         if self.up.off < LEVEL_ENOUGH:
             level, chosen = "", {"up": self.up.axis}
         else:
-            level = "pictures are turned upright, with --level the map is as well; "
+            level = "pictures are turned upright, with --level the map is as well; " if can_level else ""
             direction = tuple(round(float(part), 4) for part in self.up.direction)
             chosen = {"up": self.up.axis, "up_direction": direction}
         if chosen == {"up": "z"}:

@@ -70,7 +70,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _say_plan(plan: FleetPlan) -> None:
     say(f"{thousands(plan.frames)} frames of {plan.recordings} recordings")
     say(f"at least {plan.boxes} boxes of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
-    say(f"{size(plan.bytes)} of depth images to keep; {plan.core_hours:.2g} hours of a core like one of this machine")
+    hours = plan.core_hours
+    time = f"{hours:.2g} hours" if hours >= 1 else f"{60 * hours:.2g} minutes"
+    say(f"{size(plan.bytes)} of depth images to keep; {time} of a core like one of this machine")
     for line in plan.unreadable:
         say(f"cannot be read: {line}")
 

@@ -178,7 +178,7 @@ def settings_for(
     if profile is None:
         for one in recordings:
             try:
-                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides)
+                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides, can_level=False)
                 break
             except StereovoxError:
                 continue  # the next one may do; what is wrong with this one is told later

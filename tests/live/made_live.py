@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
-from stereovox.frame import Frame
+from stereovox.frame import FORWARD, Cloud, Frame
 from stereovox.sources.base import Stream
 
 CAMERA = PinholeCamera.from_field_of_view(64, 48, 80.0)
@@ -49,6 +49,22 @@ class Images(Stream):
                 raise self.failure
         finally:
             self.closed = True
+
+
+class Clouds(Stream):
+    """Clouds of a wall that stands `distance_m` before the lidar, in its own axes (x forward), without poses."""
+
+    name, camera, notes, posed = "lidar", FORWARD, (), False
+
+    def __init__(self, count=10, period_s=0.03, distance_m=3.05):
+        self.count, self.period_s, self.distance_m = count, period_s, distance_m
+
+    def __iter__(self):
+        y, z = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-3, 3, 120)]))
+        for k in range(self.count):
+            sleep(self.period_s)
+            x = self.distance_m + np.random.default_rng(k).normal(0, 0.003, y.size)
+            yield Cloud(np.column_stack([x, y, z]), NOWHERE, time_ns(), fault="no_pose", fault_detail="none of its own")
 
 
 def pose_at(now_ns, begin_ns):

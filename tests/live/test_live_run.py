@@ -11,7 +11,7 @@ from time import time_ns
 
 import numpy as np
 import pytest
-from made_live import Images, Sender, free_port, pose_at, udp_sender
+from made_live import Clouds, Images, Sender, free_port, pose_at, udp_sender
 
 from stereovox.cli import main
 from stereovox.config import load_config
@@ -21,7 +21,7 @@ from stereovox.formats.map_server import read_map_server
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun, map_live
 from stereovox.mapper import Mapper
-from stereovox.maps import load_map
+from stereovox.maps import State, load_map
 from stereovox.opening import open_source
 from stereovox.pose_choice import TRACK
 from stereovox.products.projection import project
@@ -73,6 +73,16 @@ def test_images_meet_the_poses_of_a_udp_stream_through_mount_and_clock(tmp_path)
     assert load_map(tmp_path / "a.svox").frames == done.map.frames
     assert done.live["latency_ms"]["since"] == "arrival"  # stamps are 100 s off this machine's clock
     assert keeper.ends == ["finish", "close"]
+
+
+def test_a_lidar_is_mounted_by_its_own_axes(tmp_path):
+    poses, lidar = LivePoses(), LiveCamera(Clouds(), "top", mount_of([0.2, 0, 0, 0, 0, 90]))
+    with Sender(lambda stamp_ns, _: poses.add(stamp_ns, np.eye(4))):
+        done = map_live(lidar, tmp_path / "a.svox", poses=poses, voxel_size=0.1, max_range=5.0)
+    left, ahead = np.array([[0.25, 3.05, 0.05]]), np.array([0, 1, 0])
+    assert done.map.state(left) == State.OCCUPIED
+    assert (done.map.state(left - ahead), done.map.state(left + ahead)) == (State.FREE, State.UNKNOWN)
+    np.testing.assert_allclose(done.map.occupied().mean(axis=0)[:2], [0.2, 3.05], atol=0.1)
 
 
 def test_the_latency_is_counted_from_the_stamp_where_that_is_by_this_machines_clock(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from autopilot import flown
-from made_live import Images
+from made_live import Clouds, Images, Sender
 
 from stereovox import StereovoxError
 from stereovox.live.poses import open_poses
@@ -11,6 +11,7 @@ from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import map_live
 from stereovox.mavlink.stream import MavlinkPoses
 from stereovox.se3 import rotation_vector
+from stereovox.sources.live_poses import LivePoses
 
 SMALL = {"voxel_size": 0.1, "max_range": 4.0}
 
@@ -53,6 +54,28 @@ def test_images_get_the_autopilots_poses_and_it_hears_of_the_wall(start_autopilo
         assert np.arctan2(T[2, 1], T[2, 2]) == pytest.approx(roll, abs=0.01)
     turned = rotation_vector(first[:3, :3] @ last[:3, :3].T)
     assert np.linalg.norm(turned) == pytest.approx(0.5 * seconds, abs=0.02)
+
+
+def told_of(autopilot, source, tmp_path, delay_s=0.0, **more):
+    """Map while an autopilot is told of obstacles and the body stands still; poses come `delay_s` late."""
+    poses = LivePoses()
+    with Sender(lambda stamp_ns, _: poses.add(stamp_ns - round(1e9 * delay_s), np.eye(4))):
+        return map_live(
+            LiveCamera(source, "one"), tmp_path / "map", poses=poses, mavlink=autopilot.url, **SMALL, **more
+        )
+
+
+def test_it_hears_of_the_wall_before_a_lidar(start_autopilot, tmp_path):
+    autopilot = start_autopilot()
+    done = told_of(autopilot, Clouds(count=30), tmp_path)
+    assert done.live["obstacle_distances"] > 0
+    autopilot.wait_for("OBSTACLE_DISTANCE", lambda told: 280 < told["distances"][0] < 306)
+
+
+def test_nothing_is_sent_by_images_that_waited_long_for_their_pose(start_autopilot, tmp_path):
+    done = told_of(start_autopilot(), Images(count=20, period_s=0.05), tmp_path, delay_s=0.8, wait_s=3.0)
+    assert done.map.frames > 5
+    assert done.live["obstacle_distances"] == 0
 
 
 def test_a_stream_is_known_by_its_name_and_says_what_is_wrong():

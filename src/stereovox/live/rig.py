@@ -35,7 +35,8 @@ class LiveCamera:
             were one, or a `Stream` of your own.
         name: Its name in the map, in reports and in recordings; "": that of its source.
         T_body_camera: (4, 4) float64, maps the camera's optical frame (x right, y down, z forward) into the body's
-            (x forward, y left, z up). Without it the camera is at the body's origin and looks ahead.
+            (x forward, y left, z up). Without it the camera is at the body's origin and looks ahead. Of a lidar it is
+            that of a camera in its place that looks along its x axis.
         clock_offset_s: Image stamp minus the stamp of a pose at the same moment, in seconds.
 
     Raises:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter, process_time
+from time import monotonic_ns, perf_counter, process_time
 from types import TracebackType
 from typing import Any
 
@@ -28,6 +28,7 @@ from stereovox.mavlink.stream import MavlinkPoses
 from stereovox.pose_choice import GIVEN, TRACK
 from stereovox.products.floor_axes import Heights
 from stereovox.run import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
+from stereovox.se3 import inverse, orthonormalise
 from stereovox.sources.base import Stream
 from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
@@ -217,7 +218,7 @@ class LiveRun:
         """
         if mavlink is not None:
             self._sender = self._obstacle_sender(mavlink)
-            self._add(self._sender)
+            self._add(_ToldOfPoses(self._sender, self.stream))
         if sphere:
             picture = None if sphere is True else sphere
             self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture)
@@ -288,8 +289,7 @@ class LiveRun:
             url_or_link = poses.link
         else:
             url_or_link = url
-        mounts = {name: T_OPTICAL_BODY @ T_body_camera for name, T_body_camera in self.stream.mounts.items()}
-        return ObstacleSender(self.mapper, url_or_link, mounts=mounts, tell=self._notify)
+        return ObstacleSender(self.mapper, url_or_link, tell=self._notify)
 
     def _add(self, output: Output) -> None:
         self.outputs.append(output)
@@ -299,6 +299,21 @@ class LiveRun:
         if self.stream.tracked:
             return TRACK
         return GIVEN if self.stream.poses is None else self.stream.poses.where
+
+
+class _ToldOfPoses:
+    """An output that tells an autopilot's sender where the body is, and how long each image waited for its pose."""
+
+    def __init__(self, sender: ObstacleSender, stream: LiveStream):
+        self._sender, self._stream = sender, stream
+        self.finish, self.close = sender.finish, sender.close
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        if report.refused:
+            return
+        T_world_body = frame.T_world_sensor @ inverse(T_OPTICAL_BODY @ self._stream.mount(frame))
+        waited_s = (monotonic_ns() - self._stream.moment.arrived_ns) / 1e9
+        self._sender.at(orthonormalise(T_world_body), frame.sensor, waited_s)
 
 
 class _Reports:

@@ -19,16 +19,16 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.frame import AnyFrame, Frame, name_of
+from stereovox.frame import AnyFrame, Cloud, Frame, name_of
 from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera
 from stereovox.pose_choice import GIVEN, HOW, TRACK
-from stereovox.se3 import inverse
+from stereovox.se3 import Transform, inverse
 from stereovox.sources.base import Stream, imu_of
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
 from stereovox.sources.live_poses import LivePoses
-from stereovox.sources.pose_stream import PoseStream
+from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.sources.waiting import Arrival, Waiting
 from stereovox.sources.wall_clock import epoch_ns
 from stereovox.survey import level_pose
@@ -177,6 +177,11 @@ class LiveStream(Stream):
         more = dict(self._stream.counts) if self._stream is not None else {}
         return {"cameras": cameras, "poses": {"added": self.poses.added, **dict(self.poses.counts), **more}}
 
+    def mount(self, frame: AnyFrame) -> Transform:
+        """Return T_body_sensor (4, 4) of what took a frame of this stream; of a cloud, from its own axes."""
+        mount = self.mounts[frame.sensor]
+        return mount @ T_OPTICAL_BODY if isinstance(frame, Cloud) else mount
+
     def __iter__(self) -> Iterator[AnyFrame]:
         end = monotonic() + (self._seconds or float("inf"))
         self._remind = monotonic() + REMIND_S
@@ -239,7 +244,7 @@ class LiveStream(Stream):
             detail = f"{name_of(frame)}: {refused}"
             nowhere = np.full((4, 4), np.nan)
             return replace(frame, T_world_sensor=nowhere, fault=refused.reason, fault_detail=detail)
-        T_world_sensor = T_world_body @ feed.camera.T_body_camera
+        T_world_sensor = T_world_body @ self.mount(frame)
         return replace(frame, T_world_sensor=T_world_sensor, fault=None, fault_detail="", pose_off_ns=0)
 
     def _run(self, feed: _Feed) -> None:

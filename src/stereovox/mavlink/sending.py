@@ -81,6 +81,7 @@ class ObstacleSender:
         self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
         self.sent = 0
         self._T_world_body: Transform | None = None
+        self._waited_s: dict[str, float] = {}
         self._why, self._new, self._stopped = "", threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="stereovox-obstacles", daemon=True)
         self._thread.start()
@@ -96,7 +97,18 @@ class ObstacleSender:
             return
         mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Cloud) else None)
         T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
-        self._T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
+        self.at(T_world_sensor if mount is None else T_world_sensor @ inverse(mount), frame.sensor)
+
+    def at(self, T_world_body: Transform, sensor: str, waited_s: float = 0.0) -> None:
+        """Take the pose of the body by a frame that the map took in; `after` does, by the mounts.
+
+        Args:
+            T_world_body: (4, 4) maps the body (optical axes) into the world.
+            sensor: Name of what took the frame.
+            waited_s: Seconds from when it arrived until the map took it in; it is as much older.
+        """
+        self._waited_s[sensor] = waited_s
+        self._T_world_body = T_world_body
         self._new.set()
 
     def finish(self) -> None:
@@ -139,9 +151,10 @@ class ObstacleSender:
 
     def _send(self) -> str:
         """Send what the map says now; return why not, nothing where it was sent."""
-        ages_s, T_world_body = self._mapper.health().ages_s, self._T_world_body
-        if T_world_body is None or not ages_s:
+        taken_s, T_world_body = self._mapper.health().ages_s, self._T_world_body
+        if T_world_body is None or not taken_s:
             return ""  # nothing has come yet, which is no news
+        ages_s = {sensor: age_s + self._waited_s.get(sensor, 0.0) for sensor, age_s in taken_s.items()}
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
         if age_s > self._max_age_s:
             return f"the last trusted frame{f' of {sensor}' if sensor else ''} is {age_s:.2f} s old"

@@ -85,6 +85,15 @@ def test_a_lidar_is_mounted_by_its_own_axes(tmp_path):
     np.testing.assert_allclose(done.map.occupied().mean(axis=0)[:2], [0.2, 3.05], atol=0.1)
 
 
+def test_several_cameras_may_be_named_and_other_things_are_none(tmp_path):
+    cameras = ["sim:room?frames=3&image_width=64", "sim:box?frames=3&image_width=64"]
+    with LiveRun(cameras, tmp_path / "a.svox", seconds=0.1, **SMALL) as run:
+        assert list(run.stream.mounts) == cameras
+    for bad in (42, [None], [cameras]):
+        with pytest.raises(SourceError, match="give the name of a camera"):
+            LiveRun(bad, tmp_path / "b.svox")
+
+
 def test_the_latency_is_counted_from_the_stamp_where_that_is_by_this_machines_clock(tmp_path):
     poses = LivePoses()
     with Sender(poses.add):

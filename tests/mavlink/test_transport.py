@@ -15,8 +15,12 @@ from stereovox.mavlink.transport import open_transport
 
 
 @pytest.mark.parametrize(
-    "url", ["", "udp:1.2.3.4:5", "udpout:host", "udpout::5", "tcp:host:port", "udpin:127.0.0.1:70000", "serial:115200"]
-)
+    "url",
+    [
+        "", "udp:1.2.3.4:5", "udpout:host", "udpout::5", "tcp:host:port", "udpin:127.0.0.1:70000", "serial:115200",
+        f"udpin:{'h' * 64}:5", "tcp:a..b:5", f"udpin:127.0.0.1:{'9' * 5000}",
+    ],
+)  # fmt: skip
 def test_other_addresses_are_refused(url):
     with pytest.raises(StereovoxError, match="connection '"):
         open_transport(url)

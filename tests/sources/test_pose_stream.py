@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from stereovox.errors import SourceError
 from stereovox.se3 import from_quaternion
-from stereovox.sources.pose_stream import MAX_LINE, T265, TcpPoses, UdpPoses, body_pose, lines_of, read_line
+from stereovox.sources.pose_stream import (
+    MAX_LINE,
+    T265,
+    PoseStream,
+    TcpPoses,
+    UdpPoses,
+    body_pose,
+    lines_of,
+    read_line,
+)
 
 SECONDS = 10.0
 
@@ -74,6 +83,26 @@ def test_an_address_in_use_is_told(stream):
     other = UdpPoses(f"udp://127.0.0.1:{stream.port}")
     with pytest.raises(SourceError, match="choose a free port"):
         other.start()
+
+
+@pytest.mark.parametrize("host", ["h" * 64, "robot..local"])
+@pytest.mark.parametrize("kind", [UdpPoses, TcpPoses])
+def test_what_cannot_be_a_host_is_refused(kind, host):
+    with pytest.raises(SourceError, match="HOST:PORT, for example"):
+        kind(f"{kind.scheme}{host}:5005")
+
+
+def test_a_stream_that_breaks_says_so_and_ends():
+    class Broken(PoseStream):
+        def _receive(self):
+            raise RuntimeError("pulled out")
+
+    stream = Broken("tracker")
+    stream.start()
+    wait_for(lambda: stream.trouble)
+    assert stream.trouble == "tracker: RuntimeError: pulled out"
+    assert stream.poses.is_final(0)  # nobody waits for a pose any more
+    stream.stop()
 
 
 def test_lines_over_tcp_come_again_after_the_server_hung_up(monkeypatch):

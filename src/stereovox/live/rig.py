@@ -49,6 +49,8 @@ class LiveCamera:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.source, str | Path) and not hasattr(self.source, "name"):
+            raise SourceError(f"camera {shown(self.source)}: give the name of a camera or recording, or a Stream")
         T = np.asarray(self.T_body_camera, float)
         if rigidity_error(T) > TOLERANCE:
             rows = "four rows of four numbers, a rotation and metres, below them 0 0 0 1"

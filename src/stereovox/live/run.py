@@ -34,7 +34,7 @@ from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.warm_up import warm_up
 
-Cameras = str | Path | Stream | LiveCamera | Sequence[LiveCamera]
+Cameras = str | Path | Stream | LiveCamera | Sequence[str | Path | Stream | LiveCamera]
 PosesFrom = str | PoseStream | LivePoses | None
 
 
@@ -93,8 +93,8 @@ def map_live(
     map is saved at regular checkpoints and at the end, as by `map_recording`.
 
     Args:
-        cameras: Name of a camera (`realsense:`) or recording, a `live.toml`, a `Stream`, or one or several
-            `LiveCamera`.
+        cameras: Name of a camera (`realsense:`) or recording, a `live.toml`, a `Stream`, a `LiveCamera`, or several of
+            these but a `live.toml`.
         out: Folder of the map to write.
         poses: `track`: the first camera is tracked by its own images; `given`: those that images come with; a name of a
             stream (`t265`, `udp://:5005`, `tcp://HOST:5005`), a `PoseStream`, or a `LivePoses` that you fill. None:
@@ -336,7 +336,7 @@ def _cameras(cameras: Cameras, poses: PosesFrom) -> tuple[Sequence[LiveCamera], 
         setup = read_live(cameras)
         return setup.cameras, poses or setup.poses or None
     if isinstance(cameras, Sequence):
-        return cameras, poses
+        return [one if isinstance(one, LiveCamera) else LiveCamera(one) for one in cameras], poses
     return [LiveCamera(cameras)], poses
 
 

@@ -39,7 +39,7 @@ def open_transport(url: str) -> Transport:
     """Return the way to an autopilot that a text names; raises StereovoxError for others and where there is none."""
     kind, _, rest = url.partition(":")
     place, _, number = rest.rpartition(":")
-    if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal():
+    if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal() or len(number) > 9:
         raise StereovoxError(f"connection '{url}': give {FORMS}")
     if kind == "serial":
         return Reopened(lambda: SerialTransport(url, place, int(number)))
@@ -49,7 +49,7 @@ def open_transport(url: str) -> Transport:
         if kind == "tcp":
             return Reopened(lambda: TcpTransport(place, int(number)))
         return UdpTransport(kind, place, int(number))
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # UnicodeError: a host of impossible length
         raise StereovoxError(f"connection '{url}': {error}; is the address right, and the port not in use?") from None
 
 

@@ -76,8 +76,13 @@ class PoseStream:
             self._receive()
             self.poses.end("the stream ended")
         except SourceError as error:
-            self.trouble = str(error)
-            self.poses.end(str(error))
+            self._fail(str(error))
+        except Exception as error:  # a device that breaks must be told, not vanish with its thread
+            self._fail(f"{self.name}: {type(error).__name__}: {error}")
+
+    def _fail(self, why: str) -> None:
+        self.trouble = why
+        self.poses.end(why)
 
 
 class Received(NamedTuple):
@@ -105,6 +110,7 @@ class LineStream(PoseStream):
             self.axes = Received(**parameters.typed(given, {"axes": "ros"})).axes
             host, _, port = name.removeprefix(self.scheme).rpartition(":")
             self.address = host.strip("[]") or HERE, int(port)
+            self.address[0].encode("idna")  # as the socket does; raises for what cannot be a host
             if not 0 <= self.address[1] < 65536:
                 raise ValueError
         except ValueError as error:

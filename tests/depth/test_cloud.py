@@ -64,6 +64,16 @@ def test_rays_end_where_the_lidar_measures_no_further():
     assert cloud.hits.tolist() == [False, True]
 
 
+def test_a_surface_at_the_end_of_the_range_is_not_freed():
+    """A wall at 2.99 m, of a lidar that measures up to 3 m, is now and then measured beyond."""
+    mapper = sv.Mapper(voxel_size=0.05)
+    for k in range(10):
+        points = np.array([[3.01, 0.03, 0.03], [2.0, 0.1 * k, 1.0]])
+        mapper.add(sv.Cloud(points, np.eye(4), 10**8 * k, sv.Lidar(range_max=3.0)))
+    states = mapper.map.state([[2.88, 0.03, 0.03], [2.99, 0.03, 0.03]])
+    assert states.tolist() == [sv.State.FREE, sv.State.UNKNOWN]
+
+
 def test_rays_without_echo_are_free_only_where_that_is_said():
     cloud = sv.Cloud(np.array([[2.0, 0, 0]]), np.eye(4), clear=np.array([[0, 3.0, 0], [np.nan, 0, 0]]))
     checked = checked_cloud(cloud, CONFIG)
@@ -190,6 +200,8 @@ def test_times_must_be_one_for_each_point_and_poses_known():
 
     with pytest.raises(FrameRefused, match="nobody knows"):
         deskewed(cloud, times, unknown)
+    with pytest.raises(FrameRefused, match="unit of its times"):
+        deskewed(cloud, np.append(times[:-1], 1e305), moving)
 
 
 @pytest.mark.parametrize("numbers", [{"sigma": 0}, {"range_min": -1}, {"range_min": 5, "range_max": 4}])

@@ -20,7 +20,8 @@ class Lidar:
     Attributes:
         sigma: Standard deviation of a range in metres.
         range_min: Metres below which a point is left out: the vehicle itself, or dirt on the window.
-        range_max: Metres beyond which a point is no surface; its ray is then free up to there.
+        range_max: Metres beyond which a point is no surface; its ray is then free up to there, and no nearer to
+            the point than four sigma.
         baseline: None: a lidar has no stereo geometry.
         width: 1, as `height`: what a lidar adds to caches that count the pixels of cameras.
         height: 1.

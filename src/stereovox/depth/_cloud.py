@@ -7,11 +7,12 @@ from stereovox._jit import kernel
 
 
 @kernel
-def usable(points, origins, range_min, range_max, ends, starts, hits):
+def usable(points, origins, range_min, range_max, reach, ends, starts, hits):
     """Write the rays of points (N, 3) that can be used one behind the other; return how many, and how many were finite.
 
     origins: (N, 3) where each was measured from, (0, 3): all from the sensor. A point at 0, 0, 0 is none. Written, (N,
-    3) each and (N,): where rays end and begin, and whether at a surface: beyond `range_max` they end there without one.
+    3) each and (N,): where rays end and begin, and whether at a surface: beyond `range_max` they end there without one,
+    and at least `reach` before the point, which may be as much nearer.
     """
     used = finite = 0
     moving = origins.shape[0] > 0
@@ -28,7 +29,7 @@ def usable(points, origins, range_min, range_max, ends, starts, hits):
         if not length >= range_min:
             continue
         far = length > range_max
-        share = range_max / length if far else 1.0
+        share = max(min(length - reach, range_max), 0.0) / length if far else 1.0
         ends[used, 0] = a + dx * share if far else x
         ends[used, 1] = b + dy * share if far else y
         ends[used, 2] = c + dz * share if far else z

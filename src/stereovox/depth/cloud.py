@@ -14,17 +14,21 @@ from stereovox.depth._cloud import usable
 from stereovox.errors import FrameRefused
 from stereovox.frame import MAX_POINTS, CheckedCloud, Cloud, name_of
 from stereovox.se3 import Transform, inverse
+from stereovox.sensors.model import REACH_SIGMA
 from stereovox.trust.validate import rigid_pose, validate_fields
 
 STEPS = 64
 """Poses of a moving sensor during one cloud: between them it moves a few centimetres at most."""
+LONGEST_S = 1e6
+"""Seconds from its stamp within which the points of a cloud are measured; numbers beyond are no times."""
 
 
 def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     """Return the rays of a cloud that say something.
 
     Points without value, and those nearer than the lidar's or the settings' minimum range, are left out: their rays
-    clear nothing. Rays beyond the lidar's own maximum range end there, with no surface.
+    clear nothing. Rays beyond the lidar's own maximum range end there, with no surface, and at least four sigma before
+    their point.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_shape`,
     `too_many_points`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_point`.
     """
@@ -40,7 +44,8 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     ends, starts, hits = np.empty((room, 3)), np.empty((room, 3)), np.zeros(room, bool)
     nearest = max(cloud.lidar.range_min, config.min_range)
     none = np.empty((0, 3)) if origins is None else origins
-    used, finite = usable(points, none, nearest, float(cloud.lidar.range_max), ends, starts, hits)
+    farthest, reach = float(cloud.lidar.range_max), REACH_SIGMA * float(cloud.lidar.sigma)
+    used, finite = usable(points, none, nearest, farthest, reach, ends, starts, hits)
     if not used and not len(clear):
         found = f"{len(points)} points, {finite} of them finite"
         raise FrameRefused("no_valid_point", f"{name_of(cloud)}: not one ray can be used ({found}); is it covered?")
@@ -63,7 +68,8 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
         not finite are then not finite.
 
     Raises:
-        FrameRefused: The pose at some time of the sweep is not known, or there is not one time for each point.
+        FrameRefused: The pose at some time of the sweep is not known, or there is not one time for each point, or they
+            are no times.
     """
     times = np.asarray(times_s, float)
     if times.shape != (len(cloud.points),):
@@ -72,6 +78,9 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
     if not known.any():
         return replace(cloud, points=np.full((len(times), 3), np.nan))
     first, last = float(times[known].min()), float(times[known].max())
+    if max(-first, last) > LONGEST_S:
+        detail = f"points were measured {first:.3g} to {last:.3g} s from its stamp, which no sweep takes"
+        raise FrameRefused("no_pose", f"{name_of(cloud)}: {detail}; what is the unit of its times?")
     knots = np.linspace(first, last, STEPS) if last > first else np.array([first])
     T_now_world = inverse(cloud.T_world_sensor)
     moved = np.array([T_now_world @ pose_at(cloud.stamp_ns + round(1e9 * knot)) for knot in knots])

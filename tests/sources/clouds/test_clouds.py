@@ -95,6 +95,33 @@ def test_times_in_a_file_and_poses_between_which_is_interpolated(tmp_path):
         sv.open_source(f"{tmp_path}?poses=way.tum")
 
 
+def test_clouds_come_in_order_of_the_times_that_their_names_tell(tmp_path):
+    for n, name in enumerate(["1.25", "1.5", "1.625"]):
+        write_pcd(tmp_path / f"{name}.pcd", POINTS + n)
+    write_poses(tmp_path, [1_250_000_000, 1_500_000_000, 1_625_000_000])
+    frames = list(sv.open_source(tmp_path))
+    assert [frame.stamp_ns for frame in frames] == [1_250_000_000, 1_500_000_000, 1_625_000_000]
+    for n, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.T_world_sensor, pose(n))
+        np.testing.assert_allclose(frame.points[0], POINTS[0] + n)
+
+
+def test_numbers_that_are_no_times_are_none(tmp_path):
+    write_pcd(tmp_path / f"{2**63}.pcd", POINTS)
+    write_poses(tmp_path, [0])
+    source = sv.open_source(tmp_path)
+    assert source.frame(0).stamp_ns == 0
+    assert "nothing says when" in source.notes[0]
+
+
+def test_points_that_were_seen_from_elsewhere_are_refused(folder):
+    file = sorted(folder.glob("*.pcd"))[1]
+    file.write_text(file.read_text().replace("VIEWPOINT 0 0 0", "VIEWPOINT 7 0 0"))
+    frames = list(sv.open_source(folder))
+    assert [frame.fault for frame in frames] == [None, "unreadable", None]
+    assert "VIEWPOINT" in frames[1].fault_detail
+
+
 def test_poses_of_a_camera_beside_the_lidar_have_other_axes(tmp_path):
     write_pcd(tmp_path / "1000000000000000000.pcd", np.array([[5.0, 0.0, 0.0]]))
     T = np.eye(4)
@@ -252,7 +279,7 @@ def test_beams_without_echo_are_free_up_to_where_the_lidar_measures(tmp_path):
         bag.add("/scan", "sensor_msgs/LaserScan", START_NS, message)
     cloud = sv.open_source(f"{tmp_path / 'a.bag'}?scan=/scan").frame(0)
     assert len(cloud.points) == len(cloud.clear) == 1
-    np.testing.assert_allclose(cloud.clear[0], 5.6 * np.array([np.cos(-0.5), np.sin(-0.5), 0]), atol=1e-5)
+    np.testing.assert_allclose(cloud.clear[0], (5.6 - 4 * 0.02) * np.array([np.cos(-0.5), np.sin(-0.5), 0]), atol=1e-5)
 
 
 @pytest.mark.parametrize(

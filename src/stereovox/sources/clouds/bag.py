@@ -12,6 +12,7 @@ import numpy as np
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Cloud
+from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
 from stereovox.sources.bags.recording import TurnedTf, file_part, read_poses
@@ -127,7 +128,7 @@ def cloud_of_scan(scan: LaserScan, options: LidarOptions | None = None) -> Cloud
     """Return a 2-D scan as a cloud in its own plane, without a pose.
 
     Args:
-        scan: The scan; +inf is nothing up to `range_max`.
+        scan: The scan; +inf is nothing up to `range_max`, less four sigma: nearer surfaces may be measured beyond it.
         options: Say how exact its ranges are.
     """
     angles = scan.angle_min + scan.angle_step * np.arange(len(scan.ranges))
@@ -136,5 +137,5 @@ def cloud_of_scan(scan: LaserScan, options: LidarOptions | None = None) -> Cloud
     lidar = replace((options or LidarOptions()).lidar, range_min=scan.range_min, range_max=scan.range_max)
     return Cloud(
         directions[hit] * scan.ranges[hit, None].astype(float), np.full((4, 4), np.nan), scan.stamp_ns, lidar,
-        clear=directions[free] * scan.range_max,
+        clear=directions[free] * max(scan.range_max - REACH_SIGMA * lidar.sigma, 0.0),
     )  # fmt: skip

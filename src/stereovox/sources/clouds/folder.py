@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, MapFileError, NoPoses, SourceError, did_you_mean
 from stereovox.frame import Cloud
@@ -23,6 +24,7 @@ from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import poses_of_images
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
+from stereovox.trust.validate import MAX_INT
 
 ENDINGS = (".pcd", ".ply", ".bin")
 SUBFOLDERS = ("", "clouds", "scans", "velodyne", "velodyne_points/data", "lidar", "pcd", "ply", "points")
@@ -81,7 +83,8 @@ class CloudFolder(CloudSource):
         self._files = _clouds_in(folder)
         if not self._files:
             raise SourceError(f"{folder}: has no clouds ({', '.join(ENDINGS)}); give a folder that has some")
-        self._stamps = self._times(folder, options.fps)
+        timed = sorted(zip(self._times(folder, options.fps), self._files, strict=True), key=lambda one: one[0])
+        self._stamps, self._files = [stamp_ns for stamp_ns, _ in timed], [path for _, path in timed]
         poses = _poses_in(folder) if not options.poses else file_of(options.poses, folder)
         if poses is None:
             raise NoPoses(f"{folder}: has no {POSE_FILES[0]}; put it there or name ?poses=FILE")
@@ -113,19 +116,13 @@ class CloudFolder(CloudSource):
     def cloud(self, i: int) -> Cloud:
         """Return cloud `i`."""
         path, T = self._files[i], self._poses.at(self._stamps[i]) @ self._T_body_lidar
-        if path.suffix.lower() == ".bin":
-            points = read_velodyne(path)
-        else:
-            try:
-                points = read_points(path).xyz
-            except MapFileError as error:
-                raise FrameRefused("unreadable", str(error)) from None
+        points = read_velodyne(path) if path.suffix.lower() == ".bin" else _measured(path)
         return Cloud(points, T, self._stamps[i], self.lidar, name=str(path))
 
     def _times(self, folder: Path, fps: float) -> list[int]:
-        """Return the times of all clouds, ascending."""
+        """Return the times of all clouds; those in names need not ascend: 7.5 comes behind 7.25, and after it."""
         stems = [path.stem for path in self._files]
-        if not fps and all(NANOSECONDS.fullmatch(stem) for stem in stems):
+        if not fps and all(NANOSECONDS.fullmatch(stem) and int(stem) < MAX_INT for stem in stems):
             return [int(stem) for stem in stems]
         if not fps and all(SECONDS.fullmatch(stem) for stem in stems):
             return [ns_from_seconds(stem) for stem in stems]
@@ -147,6 +144,21 @@ class CloudFolder(CloudSource):
                 f"{path}: has {len(stamps)} times of {len(self._files)} clouds; write one for each, ascending"
             )
         return stamps
+
+
+def _measured(path: Path) -> NDArray[np.float64]:
+    """Return the points of a `.pcd` or `.ply` (N, 3); raises FrameRefused `unreadable`.
+
+    Where a `.pcd` says that they were seen from elsewhere, rays from its origin would free what nobody saw.
+    """
+    try:
+        found = read_points(path)
+    except MapFileError as error:
+        raise FrameRefused("unreadable", str(error)) from None
+    if found.turned:
+        cure = "write VIEWPOINT 0 0 0 1 0 0 0 where points are in the lidar's own frame, else move them into it"
+        raise FrameRefused("unreadable", f"{path}: its VIEWPOINT moves or turns the lidar; {cure}")
+    return found.xyz
 
 
 def _clouds_in(folder: Path) -> list[Path]:

@@ -51,7 +51,7 @@ def warm_up(config: Config, tracked: bool = False, localised: bool = False, clou
         for frame in frames:
             mapper.add(frame)
         if clouds:
-            mapper.add(Cloud(np.float32([[middle, 0, 0], [0, middle, 0]]), T_world_camera, 9))
+            mapper.add(Cloud(middle * np.eye(2, 3), T_world_camera, 9))
         with suppress(StereovoxError):  # a map that is not level has no 2-D map
             LiveProjection(mapper.map).grid()
         mapper.close()

@@ -121,9 +121,10 @@ def test_the_sensor_that_is_silent_longest_counts(start_autopilot, frames):
         sender.after(left, mapper.add(left))
         sender.after(right, mapper.add(right))
         autopilot.wait_for("OBSTACLE_DISTANCE")
-        clock.ns += 600_000_000
+        clock.ns += 300_000_000
         newer = replace(frames[1], sensor="left")
         sender.after(newer, mapper.add(newer))
+        clock.ns += 300_000_000
         autopilot.wait_for("HEARTBEAT", number=3)
     assert "frame of right is 0.60 s old" in told[0]
 

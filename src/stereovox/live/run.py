@@ -249,7 +249,7 @@ class LiveRun:
         Raises:
             StereovoxError: All cameras failed, the disk is full, or not one image could be used.
         """
-        warm_up(self.mapper.config, self.stream.tracked)
+        warm_up(self.mapper.config, self.stream.tracked, clouds=self.stream.clouds)
         reports, latency = _Reports(), Latency(lambda: self.stream.moment)
         begin, cpu = perf_counter(), process_time()
         stopped, outputs = False, [*observers, *self.outputs]

@@ -19,7 +19,7 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.frame import AnyFrame, Cloud, Frame, name_of
+from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
 from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera
 from stereovox.pose_choice import GIVEN, HOW, TRACK
@@ -105,6 +105,7 @@ class LiveStream(Stream):
         moment: When the image that was yielded last was taken and arrived.
         mounts: T_body_camera (4, 4) by the name of the camera, which is the `sensor` of its images.
         tracked: Whether the first camera is tracked.
+        clouds: Whether one of them is a lidar.
         imu_use: What tracking made of an IMU, in words.
     """
 
@@ -127,6 +128,7 @@ class LiveStream(Stream):
         if poses is None:
             poses = GIVEN if all(getattr(feed.stream, "posed", True) for feed in self._feeds) else TRACK
         self.tracked = poses == TRACK
+        self.clouds = any(feed.stream.camera == FORWARD for feed in self._feeds)
         self._stream = poses if isinstance(poses, PoseStream) else None
         self.poses: LivePoses | None = None
         if poses == TRACK:

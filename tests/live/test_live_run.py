@@ -23,7 +23,7 @@ from stereovox.live.run import LiveRun, map_live
 from stereovox.mapper import Mapper
 from stereovox.maps import State, load_map
 from stereovox.opening import open_source
-from stereovox.pose_choice import TRACK
+from stereovox.pose_choice import GIVEN, TRACK
 from stereovox.products.projection import project
 from stereovox.se3 import inverse
 from stereovox.sources.live_poses import LivePoses
@@ -184,6 +184,14 @@ def test_the_last_camera_that_fails_ends_the_run_and_the_map_is_saved(tmp_path):
         map_live(bad, tmp_path / "a.svox", poses=poses, observers=[keeper], **SMALL)
     assert load_map(tmp_path / "a.svox").frames == 5
     assert keeper.ends == ["finish", "close"]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("poses", [GIVEN, TRACK])
+def test_a_library_that_ends_a_cameras_thread_ends_the_run(tmp_path, poses):
+    """Else the run would wait for images for ever."""
+    with pytest.raises(StereovoxError, match="not one"):
+        map_live(Images(count=2, failure=SystemExit(3)), tmp_path / "a.svox", poses=poses, **SMALL)
 
 
 def test_ctrl_c_ends_the_run_with_map_and_recording(tmp_path, obeys_signals):

@@ -54,6 +54,12 @@ def test_other_mounts_are_refused(bad):
         mount_of(bad)
 
 
+@pytest.mark.parametrize("bad", ["x", None, [[1, 2], [3]], np.full((4, 4), np.nan), np.diag([1, 1, -1, 1])])
+def test_other_matrices_are_refused(bad):
+    with pytest.raises(SourceError, match="T_body_camera must be four rows of four numbers"):
+        LiveCamera("sim:room", "a", bad)
+
+
 def test_a_file_of_two_cameras(tmp_path):
     (tmp_path / "log").mkdir()
     (tmp_path / "live.toml").write_text(GOOD)

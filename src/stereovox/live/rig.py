@@ -17,6 +17,7 @@ from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.safe_io import is_number, read_table, shown
 from stereovox.se3 import Transform, from_quaternion, orthonormalise, rigidity_error
 from stereovox.sources.base import Stream
+from stereovox.trust.validate import matrix_of
 
 TOLERANCE = 5e-3
 """Largest entry of abs(R^T R - I) that passes for rounding."""
@@ -51,7 +52,7 @@ class LiveCamera:
     def __post_init__(self) -> None:
         if not isinstance(self.source, str | Path) and not hasattr(self.source, "name"):
             raise SourceError(f"camera {shown(self.source)}: give the name of a camera or recording, or a Stream")
-        T = np.asarray(self.T_body_camera, float)
+        T = matrix_of(self.T_body_camera)
         if rigidity_error(T) > TOLERANCE:
             rows = "four rows of four numbers, a rotation and metres, below them 0 0 0 1"
             raise SourceError(f"{self.title}: T_body_camera must be {rows}")
@@ -139,17 +140,10 @@ def _camera(number: int, table: dict[str, Any], folder: Path) -> LiveCamera:
         if "mount" in table:
             given["T_body_camera"] = mount_of(table["mount"])
         if "T_body_camera" in table:
-            given["T_body_camera"] = _matrix(table["T_body_camera"])
+            given["T_body_camera"] = table["T_body_camera"]
         return LiveCamera(source, **given)
     except StereovoxError as error:
         raise SourceError(f"camera {number}: {error}") from None
-
-
-def _matrix(value: Any) -> Transform:
-    try:
-        return np.array(value, float)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)  # which is refused as no rigid motion
 
 
 def _word(table: dict[str, Any], key: str) -> str:

@@ -266,10 +266,11 @@ class LiveStream(Stream):
             feed.failure = str(error)
         except Exception as error:  # a camera that breaks must be told, not vanish with its thread
             feed.failure = f"{feed.name}: {type(error).__name__}: {error}"
-        feed.ended = True
-        if feed.tracked and self.poses is not None:
-            self.poses.end(feed.failure or "the tracked camera ended")
-        self._wake()
+        finally:
+            feed.ended = True
+            if feed.tracked and self.poses is not None:
+                self.poses.end(feed.failure or "the tracked camera ended")
+            self._wake()
 
     def _noted(self, feed: _Feed) -> Iterator[AnyFrame]:
         """Yield a camera's images, and take note when they arrive."""

@@ -67,7 +67,8 @@ class Latest(Generic[T]):
                     close()
         except Exception as raised:
             error = raised
-        queue.end(error)
+        finally:  # also where a library ends the thread: nobody may wait for it
+            queue.end(error)
 
 
 class _Queue(Generic[T]):

@@ -116,6 +116,17 @@ def test_the_ceiling_is_cut_away_and_a_landscape_is_not():
     assert ceiling(hill) == 10
 
 
+def test_reflections_far_below_make_no_ceiling_of_a_street():
+    road = np.array([[x, y, -x // 100] for x in range(200) for y in range(30)])
+    fronts = np.array([[x, y, z] for x in range(200) for y in (0, 29) for z in range(1, 10)])
+    below = np.array([[0, 0, z] for z in range(-60, -2, 2)])
+    street = np.concatenate([below, road, fronts])
+    assert ceiling(street) == 10
+    drawn = upright(VoxelMap.from_cells(CONFIG, street, [3.0] * len(street)), None, "z")
+    assert drawn.cut is None
+    assert 0 < drawn.layer < 10
+
+
 def test_the_slice_is_no_floor_or_ceiling():
     assert 0 < upright(a_room(), None, "z").layer < 19
 

@@ -10,6 +10,8 @@ UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1
 """For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
 SLAB = 1.6
 """A layer with this many times the cells of the median layer is a floor or a ceiling."""
+STRAY = 0.005
+"""This share of the cells at the bottom, and at the top, does not count for what layers usually hold: reflections."""
 
 
 def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
@@ -29,14 +31,27 @@ def turned_cells(cells: NDArray[np.int32], up: str) -> NDArray[np.int32]:
 def ceiling(occupied: NDArray[np.int32]) -> int:
     """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
 
-    A ceiling is a layer in the upper part of the map that holds far more cells than layers usually do.
+    A ceiling is a layer in the upper part of the map, with and without its stray cells, that holds far more cells than
+    layers usually do.
     """
     if not len(occupied):
         return 0
     low, count = layers(occupied)
-    upper = np.arange(len(count)) > 0.55 * len(count)
-    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count)))
+    first, end = usual_layers(count)
+    upper = np.arange(len(count)) > max(0.55 * len(count), first + 0.55 * (end - first))
+    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count[first:end])))
     return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
+
+
+def usual_layers(count: NDArray[np.int64]) -> tuple[int, int]:
+    """Return the first layer and the one after the last that have more than stray cells below, and above them.
+
+    Args:
+        count: Number of cells of each layer, one at least.
+    """
+    below = np.cumsum(count)
+    first, last = np.searchsorted(below, [STRAY * below[-1], (1 - STRAY) * below[-1]], side="right")
+    return int(first), int(min(last, len(count) - 1)) + 1
 
 
 def layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.upright import SLAB, ceiling, layers, turned_cells
+from stereovox.maps.upright import SLAB, ceiling, layers, turned_cells, usual_layers
 from stereovox.maps.upright import UPS as UPS
 from stereovox.maps.upright import turned as turned
 from stereovox.view.shading import Occlusion
@@ -61,7 +61,8 @@ class Drawn:
         """The most informative layer: no floor or ceiling, many known cells, and then the most occupied cells."""
         low, known = layers(self.cells)
         occupied = np.bincount(self.occupied[:, 2] - low, minlength=len(known))
-        usual = np.median(occupied[occupied > 0]) if occupied.any() else np.inf
+        first, end = usual_layers(occupied)
+        usual = np.median(part) if (part := occupied[first:end][occupied[first:end] > 0]).size else np.inf
         known = np.where(occupied > SLAB * usual, 0, known)
         return int(low + np.argmax(np.where(known >= 0.9 * known.max(), occupied + 1, 0)))
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
 
 from stereovox.maps import load_map  # noqa: E402
+from stereovox.ros.lifecycle import Managed  # noqa: E402
 
 INFO = "/camera/depth/camera_info"
 PATIENCE_S = 120
@@ -131,6 +133,41 @@ def test_it_has_topics_when_configured_maps_when_active_and_saves_at_cleanup(pai
     stdout, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, stderr
     assert json.loads(stdout.splitlines()[-1])["frames"] <= next(again)
+
+
+def test_a_run_whose_cleanup_waits_is_not_replaced_but_ends(alone, monkeypatch):
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID"):
+        monkeypatch.setenv(name, alone[name])
+    made, ended, asked = [], [], []
+
+    class Run:
+        def __init__(self, _):
+            self.map_node = SimpleNamespace(active=True, spin_once=self.spin_once)
+            made.append(self)
+
+        def spin_once(self):  # both calls come while messages are received
+            managed.cleanup()
+            asked.append(managed.configure())
+
+        def step(self): ...
+
+        def end(self):
+            ended.append(self)
+            return {}
+
+    rclpy.init(args=[])
+    try:
+        node = rclpy.create_node("managed")
+        managed = Managed(node, Run)
+        assert managed.configure()
+        managed.spin_once()
+        assert asked == [False]
+        assert ended == made
+        assert managed.configure()
+        assert len(made) == 2
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
 
 
 def test_a_configuration_that_cannot_be_fails_and_the_node_stays(pair):

@@ -109,6 +109,9 @@ class Managed:
 
     def configure(self) -> bool:
         """Make the topics and an empty map; return whether that was possible."""
+        if self._over:  # both were asked for before the last run could end
+            self._node.get_logger().error("not configured: the last map is still being saved; configure it again")
+            return False
         try:
             self._run = self._begin(self._entities)
         except Exception as error:  # rclpy would swallow it

@@ -76,7 +76,7 @@ def test_summaries_count_their_own_scene_and_its_collisions():
         ({"scenes": []}, "scenes"),
         ({"scenes": "sim:room"}, "give a list"),
         ({"scenes": ["drive"]}, "drive: missions are flown in simulations"),
-        ({"scenes": ["sim:nowhere"]}, "sim:nowhere"),
+        ({"scenes": ["sim:nowhere"]}, "unknown scene .nowhere"),
         ({"scenes": ["sim:hall?plan={number}"]}, "only {seed}"),
         ({"scenes": ["sim:room?axes=optical"]}, "z is not up"),
         ({"cruise": sv.Cruise(speed=0)}, "speed 0"),

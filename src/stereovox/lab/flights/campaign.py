@@ -180,8 +180,9 @@ def _check(scenes: Sequence[str], mission: str, seeds: Sequence[int], cruise: Cr
         if not Simulation.recognises(scene):
             raise SourceError(f"{scene}: missions are flown in simulations; name one, such as {SCENES[0]}")
         try:
-            simulation = Simulation(scene.format(seed=seeds[0]))
-        except (KeyError, IndexError, ValueError):
+            named = scene.format(seed=seeds[0])
+        except (KeyError, IndexError, ValueError, AttributeError):
             raise SourceError(f"{scene}: only {{seed}} may stand in braces") from None
+        simulation = Simulation(named)
         if simulation.up != "z":
             raise SourceError(f"{scene}: z is not up; leave axes=optical out")

@@ -177,6 +177,36 @@ def test_a_camera_that_fails_does_not_end_the_others(tmp_path):
     assert done.live["cameras"]["good"]["received"] == 20
 
 
+def test_each_camera_that_fails_is_told_once(tmp_path):
+    said, poses = [], LivePoses()
+    cameras = [Images(name, count, failure=SourceError(f"{name}: gone")) for name, count in (("a", 12), ("b", 3))]
+    with Sender(poses.add):
+        map_live([*cameras, Images("c", 25)], tmp_path / "a.svox", poses=poses, notify=said.append, **SMALL)
+    told = [line for line in said if "gone" in line]
+    assert told == ["b: gone; the other cameras go on", "a: gone; the other cameras go on"]
+
+
+def test_a_camera_that_goes_silent_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr("stereovox.live.stream.REMIND_S", 0.3)
+    said, told, poses = [], threading.Event(), LivePoses()
+
+    class Silent(Images):
+        def __iter__(self):
+            for image in super().__iter__():
+                yield image
+                told.wait(60)
+
+    def notify(line):
+        said.append(line)
+        if "no image has come" in line:
+            told.set()
+
+    with Sender(poses.add):
+        done = map_live(Silent("front", 5), tmp_path / "a.svox", poses=poses, notify=notify, **SMALL)
+    assert "front: no image has come for 0.3 s; is it still connected?" in said
+    assert done.live["cameras"]["front"]["received"] == 5
+
+
 def test_the_last_camera_that_fails_ends_the_run_and_the_map_is_saved(tmp_path):
     poses, keeper = LivePoses(), Keeper()
     bad = Images("bad", 5, failure=SourceError("bad: no frame for 5 s; check cable"))

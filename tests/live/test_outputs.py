@@ -89,18 +89,29 @@ def test_a_slow_disk_costs_images_of_the_recording_not_of_the_map(tmp_path, monk
     assert len(open_source(tmp_path / "log.mcap")) == WAITING + 1
 
 
-def test_a_full_disk_ends_the_recording_alone(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (
+            SourceError("log.mcap: cannot be written (No space left on device)"),
+            "log.mcap: cannot be written (No space left on device)",
+        ),
+        (RuntimeError("broken"), "log.mcap: RuntimeError: broken"),
+    ],
+)
+def test_a_full_disk_ends_the_recording_alone(error, why, tmp_path, monkeypatch):
     said = []
+    monkeypatch.chdir(tmp_path)
 
     def full(self, *args, **more):
-        raise SourceError("log.mcap: cannot be written (No space left on device)")
+        raise error
 
     monkeypatch.setattr("stereovox.sources.bags.writer.BagWriter.depth", full)
-    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL}, notify=said.append)
+    recorder = Recorder("log.mcap", {"front": T_BODY_OPTICAL}, notify=said.append)
     for k in range(3):
         recorder.after(frame(k), UpdateReport())
     recorder.close()
-    assert said == ["log.mcap: cannot be written (No space left on device); nothing is recorded, mapping goes on"]
+    assert said == [f"{why}; nothing is recorded, mapping goes on"]
     assert not list(tmp_path.iterdir())
 
 

@@ -106,9 +106,10 @@ class Recorder:
                 self._bag.__exit__(None, None, None)
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
-        except StereovoxError as error:
-            self._bag.__exit__(StereovoxError, error, None)
-            self._notify(f"{error}; nothing is recorded, mapping goes on")
+        except Exception as error:  # whatever it is, the user is told, and nobody waits for this thread
+            self._bag.__exit__(type(error), error, None)
+            why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
+            self._notify(f"{why}; nothing is recorded, mapping goes on")
             self._drain()
 
     def _write(self, frame: Frame) -> None:

@@ -41,7 +41,7 @@ ones; images that wait, for each camera, and for tracking."""
 TICK_S, SOON_S = 0.1, 0.01
 """Seconds after which a stream without news says so, and after which waiting images are looked at again."""
 REMIND_S = 5.0
-"""Seconds without any pose, or with bad lines, until the user is told."""
+"""Seconds without any pose, with bad lines, or without an image of a camera, until the user is told."""
 HOST_CLOCK_NS = 5_000_000_000
 """Stamps that are not older than this by the clock of this machine are believed to be by it."""
 REMEMBERED = 300
@@ -61,7 +61,10 @@ class Moment(NamedTuple):
 
 @dataclass(eq=False)
 class _Feed:
-    """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more."""
+    """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more.
+
+    heard_ns: when its last image came, or it was started; monotonic. told: what the user was told last that is wrong.
+    """
 
     camera: LiveCamera
     stream: Stream
@@ -71,6 +74,8 @@ class _Feed:
     before_first_pose: int = 0
     ended: bool = False
     failure: str = ""
+    heard_ns: int = 0
+    told: str = ""
     host_clock: bool | None = None
     latest: Latest[AnyFrame] | None = None
 
@@ -147,7 +152,6 @@ class LiveStream(Stream):
         )
         self._change, self._stopped = Condition(), Event()
         self._remind = 0.0
-        self._told = 0
         self.imu_use = ""
         if self.poses is not None:
             self.poses.listen(self._wake)
@@ -193,6 +197,7 @@ class LiveStream(Stream):
                 self._stream.start()
                 stack.callback(self._stream.stop)
             for feed in self._feeds:
+                feed.heard_ns = monotonic_ns()
                 thread = Thread(target=self._run, args=(feed,), name=f"stereovox-{feed.name}", daemon=True)
                 thread.start()
                 stack.callback(thread.join, STOPPING_S)
@@ -280,7 +285,7 @@ class LiveStream(Stream):
                 arrived_ns, now_ns = monotonic_ns(), epoch_ns()
                 if feed.host_clock is None:
                     feed.host_clock = 0 <= now_ns - image.stamp_ns <= HOST_CLOCK_NS
-                feed.received += 1
+                feed.received, feed.heard_ns = feed.received + 1, arrived_ns
                 feed.moments[image.stamp_ns] = Moment(
                     feed.name, image.stamp_ns if feed.host_clock else None, arrived_ns
                 )
@@ -313,11 +318,12 @@ class LiveStream(Stream):
             self._change.notify()
 
     def _tell(self) -> None:
-        """Tell the user what is wrong: cameras that failed, at once; a lack of poses, now and then."""
-        failed = [feed.failure for feed in self._feeds if feed.failure]
-        if len(failed) > self._told and len(failed) < len(self._feeds):
-            self._notify(f"{failed[-1]}; the other cameras go on")
-        self._told = len(failed)
+        """Tell the user what is wrong: with cameras, at once; with poses, now and then."""
+        for feed in self._feeds:
+            said = self._trouble(feed)
+            if said and said != feed.told:
+                self._notify(f"{said}; the other cameras go on" if len(self._feeds) > 1 else said)
+            feed.told = said
         now = monotonic()
         if now < self._remind or self.poses is None:
             return
@@ -328,6 +334,13 @@ class LiveStream(Stream):
         elif trouble and self._stream is not None:
             self._stream.trouble = ""
             self._notify(trouble)
+
+    def _trouble(self, feed: _Feed) -> str:
+        """Return why a camera delivers nothing; "" where it does, has ended, or was the last one: that is raised."""
+        if feed.ended:
+            return "" if all(one.failure for one in self._feeds) else feed.failure
+        silent = monotonic_ns() - feed.heard_ns > 1e9 * REMIND_S
+        return f"{feed.name}: no image has come for {REMIND_S:g} s; is it still connected?" if silent else ""
 
 
 class _LateTracker:

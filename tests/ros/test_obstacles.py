@@ -107,9 +107,26 @@ def published():
     mapping = Mapping(load_config("ist2019"))
     for scan in floor().scans[:15]:
         mapping.add(scan)
-    node = SimpleNamespace(create_publisher=create_publisher)
+    said = []
+    logger = SimpleNamespace(error=lambda line, **_: said.append(line))
+    node = SimpleNamespace(create_publisher=create_publisher, get_logger=lambda: logger)
     options = Options(obstacle_rate=5.0, obstacle_range=2.0)
-    return sent, heard, now, mapping, Obstacles(node, mapping, options, clock=lambda: now[0])
+    obstacles = Obstacles(node, mapping, options, clock=lambda: now[0])
+    obstacles.said = said
+    return sent, heard, now, mapping, obstacles
+
+
+def test_nothing_is_published_while_one_of_several_sensors_is_silent(published, monkeypatch):
+    sent, _, _, mapping, obstacles = published
+    ages_s = {"front": 0.1, "back": 0.6}
+    monkeypatch.setattr(mapping, "health", lambda: SimpleNamespace(ages_s=ages_s))
+    obstacles.seen(1, "map", np.eye(4))
+    obstacles.update()
+    assert sent["obstacles"] == sent["free_rays"] == []
+    assert "frame of back is 0.60 s old" in obstacles.said[0]
+    ages_s["back"] = 0.4
+    obstacles.update()
+    assert len(sent["obstacles"]) == len(sent["free_rays"]) == 1
 
 
 def test_clouds_have_one_stamp_and_frame_and_come_with_frames_alone(published):

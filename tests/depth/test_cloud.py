@@ -175,6 +175,14 @@ def test_a_cloud_of_a_moving_sensor_is_straightened():
     np.testing.assert_allclose(lengths, np.linalg.norm(cloud.points, axis=1), atol=1e-9)
 
 
+def test_one_point_with_a_wrong_time_spoils_no_other():
+    cloud, times = swept(10**8)
+    late = deskewed(cloud, np.append(times[:-1], 5.0), moving)
+    assert wall_error(late) < 0.01
+    with pytest.raises(FrameRefused, match="unit of its times"):
+        deskewed(cloud, np.append(times[:-1], 100.0), moving)
+
+
 def test_a_sensor_at_rest_changes_nothing():
     cloud = room_cloud(2, 100)
     straight = deskewed(cloud, np.zeros(100), lambda stamp_ns: cloud.T_world_sensor)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +18,10 @@ from stereovox.se3 import Transform, inverse
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.trust.validate import rigid_pose, validate_fields
 
-STEPS = 64
-"""Poses of a moving sensor during one cloud: between them it moves a few centimetres at most."""
-LONGEST_S = 1e6
-"""Seconds from its stamp within which the points of a cloud are measured; numbers beyond are no times."""
+STEPS, STEP_S = 64, 0.002
+"""Poses of a moving sensor during one cloud, and most seconds between two: it moves a few centimetres meanwhile."""
+LONGEST_S, FARTHEST_S = 10.0, 1e6
+"""Most seconds from the first to the last point of a cloud, and from its stamp; beyond, numbers are no times."""
 
 
 def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
@@ -78,10 +79,12 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
     if not known.any():
         return replace(cloud, points=np.full((len(times), 3), np.nan))
     first, last = float(times[known].min()), float(times[known].max())
-    if max(-first, last) > LONGEST_S:
+    if last - first > LONGEST_S or max(-first, last) > FARTHEST_S:
         detail = f"points were measured {first:.3g} to {last:.3g} s from its stamp, which no sweep takes"
         raise FrameRefused("no_pose", f"{name_of(cloud)}: {detail}; what is the unit of its times?")
-    knots = np.linspace(first, last, STEPS) if last > first else np.array([first])
+    knots = (
+        np.linspace(first, last, max(STEPS, ceil((last - first) / STEP_S) + 1)) if last > first else np.array([first])
+    )
     T_now_world = inverse(cloud.T_world_sensor)
     moved = np.array([T_now_world @ pose_at(cloud.stamp_ns + round(1e9 * knot)) for knot in knots])
     step = (last - first) / max(len(knots) - 1, 1) or 1.0

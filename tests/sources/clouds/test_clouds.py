@@ -64,6 +64,16 @@ def test_a_folder_of_clouds(folder):
         assert cloud.lidar == sv.Lidar()
 
 
+def test_numbered_bin_files_beside_the_poses_are_clouds_and_others_are_not(tmp_path):
+    for name in ("000000", "000001", "points3D", "calibration"):
+        write_bin(tmp_path / f"{name}.bin", POINTS[:2])
+    with pytest.raises(SourceError, match=r"clouds \(.pcd, .ply, .bin\) \(2\) but no poses"):
+        sv.open_source(tmp_path)
+    write_poses(tmp_path, [0, 10**8])
+    assert [sv.open_source(tmp_path).file(n).name for n in range(2)] == ["000000.bin", "000001.bin"]
+    assert len(sv.open_source(tmp_path)) == 2
+
+
 @pytest.mark.parametrize(("ending", "write"), [("pcd", write_pcd), ("ply", write_ply), ("bin", write_bin)])
 def test_every_kind_of_file_in_a_subfolder_numbered_with_kitti_poses(tmp_path, ending, write):
     (tmp_path / "clouds").mkdir()

@@ -32,6 +32,8 @@ POSE_FILES = ("poses.txt", "poses.tum", "groundtruth.txt", "trajectory.txt", "tr
 TIMES = ("times.txt", "timestamps.txt")
 NANOSECONDS = re.compile(r"\d{16,19}")
 SECONDS = re.compile(r"\d{1,10}\.\d+")
+NUMBERED = re.compile(r"\d{2}$|^\d+$")
+"""How the names of KITTI's clouds end; points3D.bin is none."""
 RATE_HZ = 10.0
 """Clouds a second where nothing says when they were taken: that of most spinning lidars."""
 
@@ -71,7 +73,7 @@ class CloudFolder(CloudSource):
 
     layout = "a folder of clouds (.pcd, .ply, .bin) with poses of the lidar (poses.txt)"
     parts = (
-        Part(("*.pcd", "*.ply", "*/*.pcd", "*/*.ply", "*/*.bin"), "clouds (.pcd, .ply, .bin)"),
+        Part(("*.pcd", "*.ply", "*[0-9][0-9].bin", "*/*.pcd", "*/*.ply", "*/*.bin"), "clouds (.pcd, .ply, .bin)"),
         Part(POSE_FILES, "poses of the lidar (poses.txt)"),
     )
 
@@ -165,11 +167,17 @@ def _clouds_in(folder: Path) -> list[Path]:
     """Return the clouds of a folder in the order of their names' numbers; of the first subfolder that has some."""
     for place in (folder / name for name in SUBFOLDERS):
         if place.is_dir():
-            endings = ENDINGS if place != folder else ENDINGS[:2]  # a `.bin` may be anything
-            found = [place / name for name in file_names(place) if Path(name).suffix.lower() in endings]
+            found = [place / name for name in file_names(place) if _is_cloud(name, place == folder)]
             if found:
                 return sorted(found, key=lambda path: _in_order(path.stem))
     return []
+
+
+def _is_cloud(name: str, top: bool) -> bool:
+    """Return whether a file is a cloud by its name; in the folder itself a `.bin` may be anything unless numbered."""
+    path = Path(name)
+    ending = path.suffix.lower()
+    return ending in ENDINGS and not (top and ending == ".bin" and not NUMBERED.search(path.stem))
 
 
 def _in_order(stem: str) -> tuple[list[int], str]:

@@ -55,7 +55,10 @@ def fullest_layer(voxel_map, axis):
 def test_up_is_told_and_kept_with_the_map(recording, tmp_path):
     made, lines = run(recording, tmp_path / "m.svox")
     (line,) = [line for line in lines if "up is" in line]
+    assert "with --level the map is as well" in line
     assert "--set up=" in line
+    _, lines = run(recording, tmp_path / "l.svox", level=True)
+    assert ["the map is turned upright" in line for line in lines if "up is" in line] == [True]
     again = sv.load_map(tmp_path / "m.svox").config
     assert again.up == {True: "-y", False: "y"}[TILT[1, 2] < 0]
     assert degrees(again.up_direction, TILT[:, 2]) < 5

@@ -42,7 +42,7 @@ from stereovox.rebuild import CORRECTED
 from stereovox.safe_io import check_in_space
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
-from stereovox.survey import level_start, survey
+from stereovox.survey import LEVELLED, TILTED, level_start, survey
 from stereovox.track.guided import GuidedTracker
 from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
@@ -347,7 +347,7 @@ class MapRun:
         if self.poses == TRACK:
             found = replace(found, up=None)  # which is that of the recording's own poses
         settings = found.settings if self._profile is None else found.up_settings
-        chosen, lines = settings(self._overrides, not self._level)
+        chosen, lines = settings(self._overrides, LEVELLED if self._level else TILTED)
         if self._level and found.up is not None and found.up.sure:
             chosen.setdefault("up", found.up.axis)  # where it is z, nothing had to be chosen
         return chosen, lines

@@ -41,6 +41,9 @@ MAX_CELLS_DEEP = 400
 """Cells along the longest suggested depth, where the user chose their size."""
 LEVEL_ENOUGH = np.radians(5.0)
 """Angle up to which the nearest axis is taken for up."""
+PICTURES_UPRIGHT = "pictures are turned upright"
+TILTED, LEVELLED = f"{PICTURES_UPRIGHT}, with --level the map is as well", "the map is turned upright"
+"""What becomes of a world that is not level, in words: of a fleet, of a map, and of one that is made level."""
 LEVEL, UPRIGHT = np.radians(15.0), np.radians(40.0)
 """A surface counts as horizontal within the first angle; an axis points up within the second."""
 STEADY = 0.75
@@ -127,18 +130,18 @@ class Survey:
     voxel_size: Suggestion
     notes: tuple[str, ...]
 
-    def settings(self, given: Mapping[str, Any], can_level: bool = True) -> tuple[dict[str, Any], list[str]]:
+    def settings(self, given: Mapping[str, Any], tilted: str = TILTED) -> tuple[dict[str, Any], list[str]]:
         """Choose the settings that the recording itself suggests.
 
         Args:
             given: Settings that the user chose, which are kept.
-            can_level: Whether the lines may say that `--level` turns the map upright.
+            tilted: What is said to become of a world that is not level.
 
         Returns:
             Settings by name, and lines that say which, why, and how to override them.
         """
         chosen, lines = self._size_settings(given)
-        up, said = self.up_settings(given, can_level)
+        up, said = self.up_settings(given, tilted)
         return {**chosen, **up}, [*lines, *said]
 
     def _size_settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -159,12 +162,12 @@ class Survey:
         why = self.max_range.why if "max_range" in chosen else cell.why
         return chosen, [f"{what} ({why}); else give {' or '.join(options[name] for name in chosen)}"]
 
-    def up_settings(self, given: Mapping[str, Any], can_level: bool = True) -> tuple[dict[str, Any], list[str]]:
+    def up_settings(self, given: Mapping[str, Any], tilted: str = TILTED) -> tuple[dict[str, Any], list[str]]:
         """Choose which way is up.
 
         Args:
             given: Settings that the user chose, which are kept.
-            can_level: As for `settings`.
+            tilted: As for `settings`.
 
         Returns:
             As `settings`, about up alone.
@@ -179,7 +182,7 @@ class Survey:
         if self.up.off < LEVEL_ENOUGH:
             level, chosen = "", {"up": self.up.axis}
         else:
-            level = "pictures are turned upright, with --level the map is as well; " if can_level else ""
+            level = f"{tilted}; "
             direction = tuple(round(float(part), 4) for part in self.up.direction)
             chosen = {"up": self.up.axis, "up_direction": direction}
         if chosen == {"up": "z"}:

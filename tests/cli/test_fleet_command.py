@@ -20,7 +20,7 @@ def test_two_recordings_one_line(tmp_path, capsys):
     assert main(["fleet", *recordings, "--out", str(out), *WORDS, "--json"]) == 3  # one is left out
     said = capsys.readouterr()
     result = json.loads(said.out.splitlines()[-1])
-    assert "left out: sim:nowhere: " in said.out + said.err
+    assert "left out: sim:nowhere: unknown scene" in said.out + said.err
     big = sv.load_map(out)
     assert result["boxes"] == result["boxes_mapped"] == len(big.manifest.boxes) > 0
     assert result["occupied"] == big.counts()["occupied"] > 0
@@ -38,4 +38,5 @@ def test_a_plan_writes_nothing(tmp_path, capsys):
     assert plan["boxes"] >= 1
     assert plan["bytes"] > 0
     assert plan["core_hours"] > 0
+    assert " s of a core like one of this machine" in said.out + said.err
     assert not out.exists()

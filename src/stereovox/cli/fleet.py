@@ -70,11 +70,16 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _say_plan(plan: FleetPlan) -> None:
     say(f"{thousands(plan.frames)} frames of {plan.recordings} recordings")
     say(f"at least {plan.boxes} boxes of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
-    hours = plan.core_hours
-    time = f"{hours:.2g} hours" if hours >= 1 else f"{60 * hours:.2g} minutes"
-    say(f"{size(plan.bytes)} of depth images to keep; {time} of a core like one of this machine")
+    say(f"{size(plan.bytes)} of depth images to keep; {_time(plan.core_hours)} of a core like one of this machine")
     for line in plan.unreadable:
         say(f"cannot be read: {line}")
+
+
+def _time(hours: float) -> str:
+    """Say how long, in the unit that has figures before the point."""
+    if hours < 1 / 60:
+        return f"{3600 * hours:.2g} s"
+    return f"{60 * hours:.2g} minutes" if hours < 1 else f"{hours:.2g} hours"
 
 
 def _say_map(made: FleetMap) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 from stereovox.cli.options import add_settings, overrides
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling, say_table, thousands
 
-EXAMPLE = "stereovox score 'training/image_02/*' --profile default --profile valenti2018 --out scores"
+EXAMPLE = "stereovox score 'training/image_02/*' --profile default --profile valenti2018 --voxel-size 0.5 --out scores"
 SHOWN = ("recording", "profile", "frames", "refused", "accuracy", "precision", "recall", "specificity", "npv", "error",
          "correlation")  # fmt: skip
 

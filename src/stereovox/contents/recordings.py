@@ -17,7 +17,7 @@ from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
 from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
-from stereovox.survey import LEVEL_ENOUGH, Survey, Up, survey
+from stereovox.survey import LEVEL_ENOUGH, TILTED, Survey, Up, survey
 from stereovox.track.stream import POSE_FAULTS
 
 MAX_TOPICS = 40
@@ -161,7 +161,7 @@ def _pose_lines(found: Survey) -> list[str]:
 def _up_line(up: Up) -> str:
     if not up.sure:
         return f"which way is up is not certain, perhaps {up.axis} ({up.why})"
-    tilted = "; pictures are turned upright, with --level the map is as well" if up.off > LEVEL_ENOUGH else ""
+    tilted = f"; {TILTED}" if up.off > LEVEL_ENOUGH else ""
     return f"{up.words} ({up.why}){tilted}"
 
 

@@ -42,7 +42,7 @@ from stereovox.places import Place
 from stereovox.products.merge import together
 from stereovox.run import SURVEYED
 from stereovox.safe_io import json_value
-from stereovox.survey import survey
+from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
 
 SETTINGS = "fleet.json"
@@ -149,7 +149,9 @@ def map_fleet(
             used = [one for one in listed if not reports[one].error]
             if not used:
                 first = reports[listed[0]]
-                raise StereovoxError(f"not one recording could be used, no map is written ({first.error})")
+                raise StereovoxError(
+                    f"not one recording could be used, no map is written ({first.recording}: {first.error})"
+                )
             _check_still_there(place, reports)
             boxes, before = _boxes(place, layout, [(one, reports[one].frames) for one in used]), _done(place)
             done = _mapped(run, place, layout, boxes, before, progress)
@@ -178,7 +180,7 @@ def settings_for(
     if profile is None:
         for one in recordings:
             try:
-                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides, can_level=False)
+                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
                 break
             except StereovoxError:
                 continue  # the next one may do; what is wrong with this one is told later

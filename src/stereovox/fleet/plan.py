@@ -84,7 +84,8 @@ def plan_fleet(
         try:
             length, rows, each_s, each_bytes = _looked_at(one, layout)
         except StereovoxError as error:
-            unreadable.append(f"{one.where}: {error}")
+            why = str(error).removeprefix(f"{one.where}: ")
+            unreadable.append(f"{one.where}: {why}")
             continue
         finally:
             progress(n, len(listed), "looking at recordings")

@@ -169,7 +169,8 @@ def score_fleet(
                 progress(len(rows), len(listed), "recordings")
         scores = FleetScores([row for one in listed for row in rows[one]], str(out))
         if all(row.error for row in scores.scored):
-            raise StereovoxError(f"not one recording could be scored ({scores.scored[0].error})")
+            first = scores.scored[0]
+            raise StereovoxError(f"not one recording could be scored ({first.recording}: {first.error})")
         place.write_all({SCORES: json.dumps([asdict(row) for row in scores.scored]).encode(), TABLE: _csv(scores)})
     return scores
 
@@ -191,7 +192,8 @@ def score_recording(
                     truths[sizes] = TruthCells(truth, options.tolerance)
                 rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
             except StereovoxError as error:
-                rows.append(RecordingScore(recording.where, config.profile, error=str(error)))
+                why = str(error).removeprefix(f"{recording.where}: ")
+                rows.append(RecordingScore(recording.where, config.profile, error=why))
             rows[-1] = replace(rows[-1], seconds=perf_counter() - started)
     if not any(row.error for row in rows):  # what failed is tried again
         (place / "scores").write(f"{key}.json", json.dumps([asdict(row) for row in rows]).encode())

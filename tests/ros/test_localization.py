@@ -72,6 +72,27 @@ def test_until_it_is_known_where_the_robot_is_frames_are_refused(config):
     assert not one.poses.is_final("base_link", floor().scans[0].stamp_ns)
 
 
+def test_no_pose_is_made_between_a_place_that_was_given_up_and_the_next(config):
+    one, _ = localizer(config)
+    stamps = floor().odometry.stamps_ns.tolist()
+    add_odometry(one.poses, stamps)
+    begin, middle, end = stamps[5], stamps[5] + 100_000_000, stamps[5] + 200_000_000
+    one.poses.correct(begin, np.eye(4))
+    assert one.poses.pose("base_link", begin)
+    one.forget()  # as /initialpose does
+    moved = np.eye(4)
+    moved[0, 3] = 0.5
+    one.poses.correct(end, moved)
+    with pytest.raises(FrameRefused, match="begins after"):
+        one.poses.pose("base_link", begin)
+    with pytest.raises(FrameRefused):
+        one.poses.pose("base_link", middle - 1)
+    expected = moved @ floor().odometry.at(end)
+    np.testing.assert_allclose(one.poses.pose("base_link", end).T_world_sensor, expected, atol=1e-6)
+    one.poses.correct(end + 100_000_000, moved)
+    assert one.poses.pose("base_link", end + 50_000_000)  # known at both ends: between them, too
+
+
 def test_a_place_that_is_told_counts_from_the_next_scan_on(config):
     one, _ = localizer(config, start=None)
     add_odometry(one.poses, floor().odometry.stamps_ns.tolist())

@@ -185,7 +185,13 @@ class LocalizedPoses(PoseBuffer):
             raise error
 
     def correct(self, stamp_ns: int, T_map_odom: Transform) -> None:
-        """Take in where the odometry's world is in the map, (4, 4)."""
+        """Take in where the odometry's world is in the map, (4, 4).
+
+        Where it was not known any more, what was said before is given up: between both there is no pose.
+        """
+        if self.lost:
+            self.tf.forget(self.world, self.odom)
+            self.lost = ""
         numbers = (*T_map_odom[:3, 3], *Rotation.from_matrix(T_map_odom[:3, :3]).as_quat())
         super()._add(StampedTransform(stamp_ns, self.world, self.odom, numbers))
 
@@ -244,7 +250,6 @@ class Localizer:
 
     def _take(self, found: Located) -> None:
         if found.settled:
-            self.poses.lost = ""
             self.poses.correct(found.stamp_ns, se2.lifted(found.pose_map_odom))
         else:
             self.poses.lost = (

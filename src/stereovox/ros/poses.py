@@ -36,6 +36,11 @@ class LiveEdge(Edge):
             self._keep(MAX_TRANSFORMS // 2)
         super().add(stamp_ns, numbers)
 
+    def clear(self) -> None:
+        """Drop all poses so far."""
+        self._keep(0)
+        self._sorted = None
+
     def _keep(self, newest: int) -> None:
         del self._stamps[: len(self._stamps) - newest]
         del self._rows[: len(self._rows) - 7 * newest]
@@ -50,6 +55,12 @@ class LiveTf(Tf):
     """Transforms between the frames of a running robot."""
 
     edge: ClassVar[type[Edge]] = LiveEdge
+
+    def forget(self, parent: str, child: str) -> None:
+        """Drop all poses of a frame in its parent so far."""
+        edge = self._edge(parent, child)
+        assert isinstance(edge, LiveEdge)
+        edge.clear()
 
 
 class Pose(NamedTuple):

@@ -1,5 +1,7 @@
 """Obstacle distances as an autopilot in another process reads them."""
 
+from threading import Event
+
 import numpy as np
 import pytest
 
@@ -158,6 +160,26 @@ def test_directions_come_as_one_look_round(start_autopilot, mapped):
     one_look = [m for m in looks if m["time_boot_ms"] == first["time_boot_ms"]]
     assert len(one_look) > 10
     assert all(0 < np.linalg.norm([m["x"], m["y"], m["z"]]) <= 2.0 + 1e-6 for m in looks)
+
+
+def test_where_directions_cannot_be_told_nothing_is(start_autopilot, mapped, monkeypatch):
+    def broken(*_):
+        raise StereovoxError("too many cells")
+
+    monkeypatch.setattr("stereovox.mavlink.sending.nearest_places", broken)
+    mapper, frame, report = mapped
+    told = Event()
+    said = []
+
+    def tell(line):
+        said.append(line)
+        told.set()
+
+    with ObstacleSender(mapper, start_autopilot().url, directions=DirectionRules(), tell=tell) as sender:
+        sender.after(frame, report)
+        assert told.wait(30)
+    assert said == ["no obstacle distances are sent: too many cells"]
+    assert sender.sent == 0
 
 
 def test_it_observes_a_run(start_autopilot, tmp_path):

@@ -159,12 +159,12 @@ class ObstacleSender:
         if age_s > self._max_age_s:
             return f"the last trusted frame{f' of {sensor}' if sensor else ''} is {age_s:.2f} s old"
         seen_ns = max(self.link.now_ns() - round(1e9 * age_s), 0)
-        if not self.link.send(self._sectors(T_world_body, seen_ns)):
+        sectors, places = self._sectors(T_world_body, seen_ns), self._places(T_world_body, seen_ns)
+        if not self.link.send(sectors):
             return f"{self.link.url} does not take them"
         self.sent += 1
-        for message in self._places(T_world_body, seen_ns):
-            self.link.send(message)
-        return ""
+        taken = [self.link.send(message) for message in places]
+        return "" if all(taken) else f"{self.link.url} does not take all directions"
 
     def _sectors(self, T_world_body: Transform, seen_ns: int) -> Any:
         m, rules = self.link.messages, self._rules

@@ -15,6 +15,7 @@ from typing import Any
 from stereovox import registry
 from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, NoPoses, SourceError, shortened
 from stereovox.formats import IMPORTS, UNREADABLE
+from stereovox.maps.lock import LOCK
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
 from stereovox.sources.base import Part as Part
@@ -357,11 +358,17 @@ def _contents(folder: str) -> str:
     return f"it holds {found or 'nothing'}, no depth images, stereo pairs or bag"
 
 
+def _is_only_begun(path: str) -> bool:
+    """Return whether `path` is the folder of a map that somebody begins to write and that holds nothing yet."""
+    return os.path.isdir(path) and os.listdir(path) == [LOCK]
+
+
 def _near(place: str) -> str:
     """Return a hint with the name in the same folder that is nearest to a name that is not there."""
     folder, name = os.path.split(os.path.abspath(place))
     try:
-        close = get_close_matches(name[:MAX_WORD_LENGTH], os.listdir(folder), n=1) if place else []
+        close = get_close_matches(name[:MAX_WORD_LENGTH], os.listdir(folder)) if place else []
+        close = [found for found in close if not _is_only_begun(os.path.join(folder, found))]
     except (OSError, ValueError):
         close = []
     return f" (did you mean {os.path.join(os.path.dirname(place), close[0])}?)" if close else "; check the name"

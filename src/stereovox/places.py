@@ -297,7 +297,7 @@ class Bucket(Place):
         except (known.BaseError, OSError) as error:
             reason = str(error).partition("\n")[0].strip()[:200]
             raise MapFileError(
-                f"{self}/{name}: the store cannot be used ({reason}); check AWS_ENDPOINT_URL and the network"
+                f"{self}/{name}: the store cannot be used ({reason}); check AWS_ENDPOINT_URL, keys and the network"
             ) from None
 
 

@@ -57,6 +57,7 @@ SeenT = TypeVar("SeenT")
 MapT = TypeVar("MapT", VoxelMap, GridMap)
 
 CHECKPOINT_S = 10.0
+NOTHING_CAME = "the source is empty"
 REST = 25
 """Minimum pause between two saves, in durations of a save: saves take at most 4 % of a run."""
 SURVEYED = 10
@@ -290,9 +291,8 @@ class MapRun:
             self._lost = LostSpans(frames_offered(self.mapper))
             reports = self._add_all(check, (*observers, *([self._lost] if self.poses != GIVEN else [])))
             if not self.mapper.map.frames:
-                raise StereovoxError(
-                    f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
-                )
+                why = first_refusal(reports, getattr(self.source, "why_none", NOTHING_CAME))
+                raise StereovoxError(f"{self.source.name}: not one frame could be used, no map is written ({why})")
             self._checkpoints.save(frames_offered(self.mapper))
             closure = self._closure(check, closing)
         for tracker in self._trackers[-1:]:
@@ -557,9 +557,9 @@ def replaces(out: Path) -> str:
         return f"note: {out} replaces a damaged map that is there"
 
 
-def first_refusal(reports: list[UpdateReport]) -> str:
-    """Return why the first of the refused frames was refused, for the error that none could be used."""
-    return next((report.detail for report in reports if report.refused), "the source is empty")
+def first_refusal(reports: list[UpdateReport], none: str = NOTHING_CAME) -> str:
+    """Return why the first of the refused frames was refused, or `none`, for the error that none could be used."""
+    return next((report.detail for report in reports if report.refused), none)
 
 
 class Checkpoints:

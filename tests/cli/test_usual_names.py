@@ -56,3 +56,9 @@ def test_names_follow_the_recording(source, name, tmp_path, monkeypatch):
 def test_the_picture_of_a_floor_spares_its_image():
     assert picture_name("maps/room.svox") == "room.png"
     assert picture_name("maps/floor.yaml") == "floor-picture.png"
+
+
+def test_the_map_that_would_be_written_is_no_guess_at_what_was_meant(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["map", "nowhere"]) == 2
+    assert "nowhere: no such folder or file; check the name" in capsys.readouterr().err

@@ -126,8 +126,9 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     for name, counts in live["cameras"].items():
         lost = f"{counts['dropped']} dropped"
         early = f", {counts['before_first_pose']} before the first pose" if counts["before_first_pose"] else ""
+        slow = f", {counts['late']} of them late: it cannot be played at its pace" if counts.get("late") else ""
         failed = f"; failed: {counts['failure']}" if "failure" in counts else ""
-        say(f"  {name}: {counts['received']} images came, {lost}{early}{failed}")
+        say(f"  {name}: {counts['received']} images came, {lost}{early}{slow}{failed}")
     if "poses" in live:
         say(f"poses of {result['poses']}: {', '.join(f'{count} {what}' for what, count in live['poses'].items())}")
     latency = live["latency_ms"]

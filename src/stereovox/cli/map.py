@@ -168,7 +168,7 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"per pair: {result['match_ms']['median']:.3g} ms to match it (median)")
     depth, cells = result["depth_ms"]["median"], result["integrate_ms"]["median"]
-    times = f"{depth:.2g} ms to prepare the depth image, {cells:.2g} ms to map it (medians)"
+    times = f"{depth:.2g} ms to prepare it, {cells:.2g} ms to map it (medians)"
     say(f"per frame: {times}{first_included(result)}")
     say(cells_line(result, config.voxel_size))
     if (kept := mapped.map.kept_frames) is not None:

@@ -19,9 +19,9 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
 
     `settled`: how often frames were accepted again after a jump or a reset, by the report's description. `ways`: number
     of frames by quality level, full or reduced to meet the deadline (docs/safety.md).
-    `frame_ms` is the whole of a frame, `match_ms` (stereo pairs), `depth_ms` and `integrate_ms` are its parts. Times
-    leave out the first mapped frame, which may compile kernels. `memory_reserved`: the memory is that of a window,
-    reserved at the start.
+    `frame_ms` is the whole of a frame, `match_ms` (of stereo pairs alone), `depth_ms` and `integrate_ms` are its parts.
+    Times leave out the first mapped frame, which may compile kernels. `memory_reserved`: the memory is that of a
+    window, reserved at the start.
     """
     mapped = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)
@@ -31,7 +31,7 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
         "refused": dict(refused.most_common()),
         "settled": dict(Counter(report.detail for report in mapped if report.detail).most_common()),
         "ways": dict(Counter(report.way for report in mapped).most_common()),
-        "match_ms": percentiles([report.match_ms for report in mapped]),
+        "match_ms": percentiles([report.match_ms for report in mapped if report.match_ms]),
         "depth_ms": percentiles([report.depth_ms for report in mapped]),
         "integrate_ms": percentiles([report.integrate_ms for report in mapped]),
         "frame_ms": percentiles([report.match_ms + report.depth_ms + report.integrate_ms for report in mapped]),

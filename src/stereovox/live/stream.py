@@ -28,6 +28,7 @@ from stereovox.sources.base import Stream, imu_of
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
 from stereovox.sources.live_poses import LivePoses
+from stereovox.sources.paced import Paced
 from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.sources.waiting import Arrival, Waiting
 from stereovox.sources.wall_clock import epoch_ns
@@ -168,12 +169,16 @@ class LiveStream(Stream):
         return {name: imu for name, imu in found.items() if imu is not None}
 
     def counts(self) -> dict[str, Any]:
-        """Return what became of images and poses: by camera `received`, `dropped`, `before_first_pose`; of poses."""
+        """Return what became of images and poses: by camera `received`, `dropped`, `before_first_pose`; of poses.
+
+        Of a recording or simulation also how many were `late`: it could not be read or drawn at its pace.
+        """
         cameras = {
             feed.name: {
                 "received": feed.received,
                 "dropped": self._waiting.dropped[feed.name] + (feed.latest.dropped if feed.latest else 0),
                 "before_first_pose": feed.before_first_pose,
+                **({"late": feed.stream.late} if isinstance(feed.stream, Paced) and feed.stream.late else {}),
                 **({"failure": feed.failure} if feed.failure else {}),
             }
             for feed in self._feeds
@@ -187,6 +192,14 @@ class LiveStream(Stream):
         """Return T_body_sensor (4, 4) of what took a frame of this stream; of a cloud, from its own axes."""
         mount = self.mounts[frame.sensor]
         return mount @ T_OPTICAL_BODY if isinstance(frame, Cloud) else mount
+
+    @property
+    def why_none(self) -> str:
+        """Why no image has become a frame, in words."""
+        early = sum(feed.before_first_pose for feed in self._feeds)
+        if self.poses is None or not early:
+            return "no image came"
+        return f"{early} images came, but no pose: {self.poses.where}"
 
     def __iter__(self) -> Iterator[AnyFrame]:
         end = monotonic() + (self._seconds or float("inf"))

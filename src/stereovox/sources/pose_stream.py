@@ -18,7 +18,7 @@ from stereovox.se3 import Transform, from_quaternion
 from stereovox.sources import parameters
 from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.realsense import library
-from stereovox.sources.realsense_imu import ns_from_ms
+from stereovox.sources.realsense_sensor import ns_from_ms
 from stereovox.sources.tracker import AXES, HIGHEST_CONFIDENCE, turned
 from stereovox.sources.trajectory import FORMAT, ns_from_seconds
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from typing import Any, NoReturn, TypeVar
 
@@ -16,8 +17,9 @@ from stereovox.frame import Frame
 from stereovox.sources import parameters
 from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu
-from stereovox.sources.realsense_imu import FIRST_IMAGES, FIRST_S, find_motion, ns_from_ms
+from stereovox.sources.realsense_imu import FIRST_IMAGES, FIRST_S, find_motion
 from stereovox.sources.realsense_photo import find_photos
+from stereovox.sources.realsense_sensor import ns_from_ms, stopped
 
 T = TypeVar("T")
 
@@ -91,15 +93,15 @@ class RealSense(Stream):
             _failed(location, error)
         self.name = PREFIX + _serial(self._rs, self._device)
         self.posed = self.options.pose == "fixed"
-        self._motion = self._beside("IMU", self.options.imu, find_motion)
+        self._motion = self._beside("IMU", self.options.imu, partial(find_motion, name=self.name))
         self._photos = self._beside("colour camera", self.options.photo, find_photos)
 
-    def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any, str], T | None]) -> T | None:
+    def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any], T | None]) -> T | None:
         """Return a sensor that helps to track, None where there is none, or the camera does not say where it is."""
         if self.posed or option == "off":
             return None
         try:
-            return find(self._rs, self._device, self._profile, self.name)
+            return find(self._rs, self._device, self._profile)
         except (RuntimeError, StereovoxError) as error:
             self.notes = (*self.notes, f"{self.name}: its {what} is not used ({' '.join(str(error).split())})")
             return None
@@ -119,18 +121,15 @@ class RealSense(Stream):
         """
         queue = self._rs.frame_queue(WAITING)
         try:
-            self._sensor.open(self._profile)
-        except RuntimeError as error:
-            _failed(self.name, error)
-        try:
-            try:
-                self._sensor.start(queue)
-            except RuntimeError as error:
-                _failed(self.name, error)
             if self._motion is not None and not self._motion.start():
                 self._motion = None
             if self._photos is not None and not self._photos.start():
                 self._photos = None
+            try:
+                self._sensor.open(self._profile)
+                self._sensor.start(queue)
+            except RuntimeError as error:
+                _failed(self.name, error)
             for number in count():
                 arrived, image = queue.try_wait_for_frame(PATIENCE_MS)
                 if not arrived:
@@ -148,15 +147,10 @@ class RealSense(Stream):
         return self._motion.imu.seconds >= FIRST_S or images >= FIRST_IMAGES
 
     def _stop(self) -> None:
-        if self._motion is not None:
-            self._motion.stop()
-        if self._photos is not None:
-            self._photos.stop()
-        for end in (self._sensor.stop, self._sensor.close):
-            try:
-                end()
-            except RuntimeError:
-                continue  # pulled out: there is nothing left to stop
+        for beside in (self._motion, self._photos):
+            if beside is not None:
+                beside.stop()
+        stopped(self._sensor)
 
     def _frame(self, image: Any) -> Frame:
         depth = np.array(image.get_data())  # a copy: the library uses its memory again

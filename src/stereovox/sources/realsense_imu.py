@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
-from stereovox.se3 import Transform
 from stereovox.sources.imu import LiveImu
+from stereovox.sources.realsense_sensor import SideSensor, ns_from_ms, transform_between
 
 WAITING = 2000
 """Readings that may wait for the next image."""
@@ -17,7 +14,7 @@ FIRST_S, FIRST_IMAGES = 0.5, 30
 """Images wait until the IMU has spoken for so long, to tell which way is up; so many at most."""
 
 
-class MotionSensor:
+class MotionSensor(SideSensor):
     """Fills a `LiveImu` with what the camera's motion sensor measures.
 
     Args:
@@ -28,26 +25,8 @@ class MotionSensor:
     """
 
     def __init__(self, rs: Any, sensor: Any, profiles: dict[str, Any], imu: LiveImu):
+        super().__init__(rs, sensor, list(profiles.values()), WAITING)
         self.imu = imu
-        self._rs, self._sensor, self._profiles = rs, sensor, profiles
-        self._queue: Any = None
-
-    def start(self) -> bool:
-        """Start measuring; return whether the camera does."""
-        self._queue = self._rs.frame_queue(WAITING)
-        try:
-            self._sensor.open(list(self._profiles.values()))
-            self._sensor.start(self._queue)
-        except RuntimeError:
-            self.stop()
-            return False
-        return True
-
-    def stop(self) -> None:
-        """Stop measuring."""
-        for end in (self._sensor.stop, self._sensor.close):
-            with suppress(RuntimeError):  # pulled out, or never started
-                end()
 
     def read(self) -> None:
         """Take in what was measured since."""
@@ -71,21 +50,6 @@ def find_motion(rs: Any, device: Any, depth_profile: Any, name: str) -> MotionSe
                 rs, sensor, found, LiveImu(transform_between(found["gyro"], depth_profile), f"{name} IMU")
             )
     return None
-
-
-def ns_from_ms(milliseconds: float) -> int:
-    """Return whole nanoseconds; times 1e6 as a float, today's dates would be off by up to 128 ns."""
-    whole, rest = divmod(milliseconds, 1.0)
-    return int(whole) * 1_000_000 + round(rest * 1e6)
-
-
-def transform_between(one: Any, other: Any) -> Transform:
-    """Return T_other_one (4, 4) of two streams by the camera's own calibration; raises RuntimeError without one."""
-    T = np.eye(4)
-    found = one.get_extrinsics_to(other)
-    T[:3, :3] = np.reshape(found.rotation, (3, 3)).T  # librealsense stores rotations column by column
-    T[:3, 3] = found.translation
-    return T
 
 
 def _fps(profile: Any) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from time import monotonic
 from typing import Any
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Photo
 from stereovox.se3 import Transform
-from stereovox.sources.realsense_imu import ns_from_ms, transform_between
+from stereovox.sources.realsense_sensor import SideSensor, ns_from_ms, transform_between
 from stereovox.sources.rgbd.undistort import Undistortion
 
 WAITING = 4
@@ -34,7 +33,7 @@ GREY_FROM: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
 """Forms that a colour camera may send, the cheapest first, and what is made of each: a grey or an RGB image."""
 
 
-class PhotoSensor:
+class PhotoSensor(SideSensor):
     """Returns the picture that was taken with a depth image.
 
     Args:
@@ -48,32 +47,18 @@ class PhotoSensor:
     """
 
     def __init__(self, rs: Any, sensor: Any, profile: Any, T_depth_photo: Transform):
-        self._rs, self._sensor, self._profile, self._T = rs, sensor, profile, T_depth_photo
+        super().__init__(rs, sensor, [profile], WAITING)
+        self._T = T_depth_photo
         lens = profile.get_intrinsics()
         self.camera = PinholeCamera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
         self._undistort = Undistortion(self.camera, lens.coeffs)  # RealSense's ROS driver takes them so too
         self._grey = GREY_FROM[_form(rs, profile)]
-        self._queue: Any = None
         self._waiting: deque[tuple[int, Any]] = deque(maxlen=WAITING)
 
-    def start(self) -> bool:
-        """Start taking pictures; return whether the camera does."""
-        self._waiting.clear()
-        self._queue = self._rs.frame_queue(WAITING)
-        try:
-            self._sensor.open(self._profile)
-            self._sensor.start(self._queue)
-        except RuntimeError:
-            self.stop()
-            return False
-        return True
-
     def stop(self) -> None:
-        """Stop taking pictures."""
+        """Stop taking pictures, and give those that wait back to the library."""
         self._waiting.clear()
-        for end in (self._sensor.stop, self._sensor.close):
-            with suppress(RuntimeError):  # pulled out, or never started
-                end()
+        super().stop()
 
     def near(self, stamp_ns: int) -> Photo | None:
         """Return the picture nearest to a depth image of that time, None where none is within 20 ms.
@@ -104,7 +89,7 @@ class PhotoSensor:
                 self._waiting.append((ns_from_ms(image.get_timestamp()), image))
 
 
-def find_photos(rs: Any, device: Any, depth_profile: Any, _: str) -> PhotoSensor | None:
+def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
     """Return the colour camera beside a depth camera, in a mode of its rate; None where there is none.
 
     Raises RuntimeError and StereovoxError where the camera does not say how it sees or where it is.

@@ -14,7 +14,7 @@ rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 has no wheel for t
 from made_realsense import FPS, HEIGHT, UNIT, WIDTH, SoftwareCamera, depth, picture, stamp_ns  # noqa: E402
 
 from stereovox.cli import main, recordings  # noqa: E402
-from stereovox.errors import MissingExtra, SourceError  # noqa: E402
+from stereovox.errors import FrameRefused, MissingExtra, SourceError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
 from stereovox.opening import Excerpt, open_source, open_stream  # noqa: E402
 from stereovox.sources import realsense  # noqa: E402
@@ -74,8 +74,15 @@ def test_without_a_pose_the_depth_is_there_and_says_how_to_get_one(camera):
 
 
 def pictured(stream):
-    """Frames from the first with a picture on; the depth camera may be quicker than the colour camera."""
-    return dropwhile(lambda frame: frame.photo is None, islice(stream, 100))
+    """Frames and their pictures, from the first on: the depth camera may be quicker than the colour camera."""
+    return dropwhile(lambda pair: pair[1] is None, ((frame, pixels_of(frame)) for frame in islice(stream, 100)))
+
+
+def pixels_of(frame):
+    try:
+        return frame.photo.pixels()
+    except FrameRefused:
+        return None
 
 
 @pytest.mark.parametrize("form", ["yuyv", "rgb8"])
@@ -84,13 +91,13 @@ def test_pictures_come_with_the_depth_images_of_their_time(camera, form):
     stream = open_stream("realsense:")
     assert stream.notes == ()
     with camera.sending():
-        frames = list(islice(pictured(stream), 6))
+        pairs = list(islice(pictured(stream), 6))
     with pytest.raises(RuntimeError, match="not streaming"):
         camera.colour.stop()
-    for frame in frames:
-        assert frame.photo is not None
-        grey = frame.photo.pixels if form == "yuyv" else frame.photo.pixels[..., 1]
+    for frame, pixels in pairs:
+        grey = pixels if form == "yuyv" else pixels[..., 1]
         np.testing.assert_array_equal(grey, picture(number(frame)))
+        assert pixels_of(frame) is pixels  # kept for those who ask again, also after the camera's end
         assert (frame.photo.camera.width, frame.photo.camera.fx) == (WIDTH, 24.0)
         np.testing.assert_allclose(frame.photo.T_sensor_camera[:3, 3], [0.015, 0, 0])
 
@@ -98,21 +105,22 @@ def test_pictures_come_with_the_depth_images_of_their_time(camera, form):
 def test_of_pictures_at_other_times_the_nearest_is_taken_and_none_that_is_far(camera):
     camera.add_pictures(rs.format.yuyv, late_ns=-25_000_000)  # the next one is 8 ms after its depth image
     with camera.sending():
-        for frame in islice(pictured(open_stream("realsense:")), 3):
-            np.testing.assert_array_equal(frame.photo.pixels, picture(number(frame) + 1))
+        for frame, pixels in islice(pictured(open_stream("realsense:")), 3):
+            np.testing.assert_array_equal(pixels, picture(number(frame) + 1))
     camera.late_ns = -1_000_000_000
     with camera.sending():
-        assert all(frame.photo is None for frame in islice(open_stream("realsense:"), 3))
+        for frame in islice(open_stream("realsense:"), 3):
+            with pytest.raises(FrameRefused, match="no picture within 20 ms"):
+                frame.photo.pixels()
 
 
 def test_pictures_of_a_lens_that_distorts_are_straightened(camera):
     camera.add_pictures(rs.format.yuyv, coefficients=[-0.3, 0.1])
     with camera.sending():
-        frame = next(pictured(open_stream("realsense:")))
-    from_corner = frame.photo.pixels[0, 0]
-    assert from_corner != picture(number(frame))[0, 0]
+        frame, pixels = next(pictured(open_stream("realsense:")))
+    assert pixels[0, 0] != picture(number(frame))[0, 0]
     middle = HEIGHT // 2, WIDTH // 2
-    assert frame.photo.pixels[middle] == picture(number(frame))[middle]
+    assert pixels[middle] == picture(number(frame))[middle]
 
 
 @pytest.mark.parametrize("options", ["?photo=off", "?pose=fixed"])

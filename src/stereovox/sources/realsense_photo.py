@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import cache, partial
+from threading import Lock
 from time import monotonic
 from typing import Any
 
@@ -12,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.errors import FrameRefused
 from stereovox.frame import Photo
 from stereovox.se3 import Transform
 from stereovox.sources.realsense_sensor import SideSensor, ns_from_ms, transform_between
 from stereovox.sources.rgbd.undistort import Undistortion
 
-WAITING = 4
-"""Pictures that may wait for the next depth image."""
+WAITING = 6
+"""Newest pictures that are kept for those who track or record depth images a little later."""
 WITHIN_NS, PATIENCE_MS = 20_000_000, 15
-"""How far a picture may be from its depth image, and how long that waits for a picture that is late."""
+"""How far a picture may be from its depth image, and how long one that is late is waited for."""
 PREFERRED = (640, 480)
 """Width and height."""
 GREY_FROM: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
@@ -54,26 +57,35 @@ class PhotoSensor(SideSensor):
         self._undistort = Undistortion(self.camera, lens.coeffs)  # RealSense's ROS driver takes them so too
         self._grey = GREY_FROM[_form(rs, profile)]
         self._waiting: deque[tuple[int, Any]] = deque(maxlen=WAITING)
+        self._lock = Lock()
 
     def stop(self) -> None:
         """Stop taking pictures, and give those that wait back to the library."""
-        self._waiting.clear()
+        with self._lock:
+            self._waiting.clear()
         super().stop()
 
-    def near(self, stamp_ns: int) -> Photo | None:
-        """Return the picture nearest to a depth image of that time, None where none is within 20 ms.
+    def near(self, stamp_ns: int) -> Photo:
+        """Return the picture nearest to a depth image of that time, which is read once it is needed.
 
-        Waits for it for 15 ms where only earlier ones have come.
+        Its `pixels` wait for 15 ms where only earlier ones have come; they raise FrameRefused where none is within
+        20 ms, or is kept no more.
         """
+        return Photo(cache(partial(self._pixels, stamp_ns)), self.camera, self._T)
+
+    def _pixels(self, stamp_ns: int) -> NDArray[np.uint8]:
+        with self._lock:
+            return self._read(stamp_ns)
+
+    def _read(self, stamp_ns: int) -> NDArray[np.uint8]:
         self._take(stamp_ns)
         stamp, image = min(self._waiting, key=lambda one: abs(one[0] - stamp_ns), default=(0, None))
         if image is None or abs(stamp - stamp_ns) > WITHIN_NS:
-            return None
+            raise FrameRefused("no_photo", f"no picture within 20 ms of the depth image at {stamp_ns}")
         size = self.camera.height, self.camera.width
         data = np.ascontiguousarray(image.get_data()).view(np.uint8).reshape(*size, -1)
         grey = self._grey(data if data.shape[2] > 1 else data[..., 0])
-        pixels = np.array(self._undistort(grey))  # a copy: the library uses its memory again
-        return Photo(pixels, self.camera, self._T)
+        return np.array(self._undistort(grey))  # a copy: the library uses its memory again
 
     def _take(self, stamp_ns: int) -> None:
         """Take in pictures that came, and wait for one that is not older than `stamp_ns`."""

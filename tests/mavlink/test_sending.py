@@ -217,3 +217,25 @@ def test_a_lidar_looks_along_its_own_axes(start_autopilot, mapped):
             heard.append(autopilot.wait_for("OBSTACLE_DISTANCE")[0]["distances"])
         autopilot.drain()
     assert heard[0] == heard[1]
+
+
+class Told(ObstacleSender):
+    """A sender that only notes the poses it would tell of."""
+
+    def __init__(self, *args, **options):
+        self.poses, self.told = [], Event()
+        super().__init__(*args, **options)
+
+    def _send(self):
+        self.poses.append(self._T_world_body)
+        self.told.set()
+        return ""
+
+
+def test_a_message_waits_for_the_next_frame_and_goes_once_it_is_there(start_autopilot, mapped):
+    pose = np.eye(4)
+    with Told(mapped[0], start_autopilot().url, rate_hz=0.1) as sender:  # waits for up to 5 s
+        sender.told.wait(0.5)
+        sender.at(pose, "")
+        assert sender.told.wait(4)
+        assert sender.poses[0] is pose and len(sender.poses) == 1

@@ -65,7 +65,6 @@ class Reopened:
     def read(self, seconds: float) -> bytes:
         """Return what came; open the way anew where it broke."""
         if self._broken:
-            self._way.close()
             if monotonic() < self._due_s:
                 raise ConnectionError("the connection is gone")
             self._due_s = monotonic() + RETRY_S
@@ -74,6 +73,7 @@ class Reopened:
             return self._way.read(seconds)
         except OSError:
             self._broken = True
+            self._way.close()
             raise
 
     def write(self, data: bytes) -> None:

@@ -238,4 +238,4 @@ def test_a_message_waits_for_the_next_frame_and_goes_once_it_is_there(start_auto
         sender.told.wait(0.5)
         sender.at(pose, "")
         assert sender.told.wait(4)
-        assert sender.poses[0] is pose and len(sender.poses) == 1
+        assert [one is pose for one in sender.poses] == [True]

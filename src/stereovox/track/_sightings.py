@@ -21,7 +21,8 @@ def equations(
     fx, fy, cx, cy = lens
     work[0] = 0.0
     by_place, by_world, by_motion, weighted = work[0], work[1], work[2], work[3]
-    arm, q, off, by_inverse, scaled = work[4, 0], work[4, 1], work[4, 2], work[5, 0], work[5, 1]
+    arm, q, off, by_inverse, scaled, own = work[4, 0], work[4, 1], work[4, 2], work[5, 0], work[5, 1], work[5, 2]
+    own[0], own[1] = 2 * pixel * pixel, 2 * pixel * pixel
     for i in range(inverse.shape[0]):
         rho = inverse[i]
         for k in range(3):
@@ -46,17 +47,16 @@ def equations(
             by_motion[j, 3], by_motion[j, 4], by_motion[j, 5] = -rho * w0, -rho * w1, -rho * w2
             by_inverse[j] = w0 * arm[0] + w1 * arm[1] + w2 * arm[2]
         by_inverse[2] += 1 / z
+        own[2] = deviation[i] * deviation[i]
         for j in range(3):
-            own = 2 * pixel * pixel if j < 2 else deviation[i] * deviation[i]
-            scaled[j] = by_inverse[j] / own
+            scaled[j] = by_inverse[j] / own[j]
             spread += by_inverse[j] * scaled[j]
         share = variance[i] / (1 + variance[i] * spread)  # Sherman and Morrison 1950
         squares, along = 0.0, 0.0
         for j in range(3):
             along += scaled[j] * off[j]
         for j in range(3):
-            own = 2 * pixel * pixel if j < 2 else deviation[i] * deviation[i]
-            squares += off[j] * off[j] / own
+            squares += off[j] * off[j] / own[j]
         squares -= share * along * along
         weight = 1 / (alike * (1 + squares / reach) ** 2)
         for k in range(6):
@@ -64,8 +64,7 @@ def equations(
             for j in range(3):
                 common += scaled[j] * by_motion[j, k]
             for j in range(3):
-                own = 2 * pixel * pixel if j < 2 else deviation[i] * deviation[i]
-                weighted[j, k] = weight * (by_motion[j, k] / own - share * scaled[j] * common)
+                weighted[j, k] = weight * (by_motion[j, k] / own[j] - share * scaled[j] * common)
         for k in range(6):
             for j in range(3):
                 gradient[k] += weighted[j, k] * off[j]

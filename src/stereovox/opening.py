@@ -16,6 +16,7 @@ from stereovox import registry
 from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, NoPoses, SourceError, shortened
 from stereovox.formats import IMPORTS, UNREADABLE
 from stereovox.maps.lock import LOCK
+from stereovox.sources.bags.files import cut_off
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
 from stereovox.sources.base import Part as Part
@@ -366,6 +367,8 @@ def _is_only_begun(path: str) -> bool:
 def _near(place: str) -> str:
     """Return a hint with the name in the same folder that is nearest to a name that is not there."""
     folder, name = os.path.split(os.path.abspath(place))
+    if place and (left := cut_off(place)):
+        return f", but a recording that was cut off: {left}"
     try:
         close = get_close_matches(name[:MAX_WORD_LENGTH], os.listdir(folder)) if place else []
         close = [found for found in close if not _is_only_begun(os.path.join(folder, found))]

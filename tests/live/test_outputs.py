@@ -2,13 +2,16 @@
 """Outputs of a growing map: files of the 2-D map that are written anew, recordings that do not hold the map up."""
 
 import json
+import sys
 import threading
 from dataclasses import replace
+from subprocess import PIPE, Popen
 
 import numpy as np
 import pytest
 from made_live import CAMERA, wall
 
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
@@ -19,6 +22,7 @@ from stereovox.live.recorder import WAITING, Recorder, optical, topic
 from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
+from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.wall_clock import epoch_ns
 
 MS = 1_000_000
@@ -113,6 +117,74 @@ def test_a_full_disk_ends_the_recording_alone(error, why, tmp_path, monkeypatch)
     recorder.close()
     assert said == [f"{why}; nothing is recorded, mapping goes on"]
     assert not list(tmp_path.iterdir())
+
+
+def test_what_was_recorded_before_the_disk_was_full_is_kept(tmp_path, monkeypatch):
+    said, depth = [], BagWriter.depth
+    monkeypatch.chdir(tmp_path)
+
+    def filling(self, frame, *args, **more):
+        if frame.stamp_ns >= 10**18 + 20 * 33 * MS:
+            raise SourceError("log.mcap: cannot be written (No space left on device)")
+        depth(self, frame, *args, **more)
+
+    monkeypatch.setattr(BagWriter, "depth", filling)
+    recorder = Recorder("log.mcap", {"front": T_BODY_OPTICAL}, notify=said.append)
+    camera, noise = PinholeCamera(320, 240, 200.0, 200.0, 159.5, 119.5), np.random.default_rng(0)
+    for k in range(21):
+        large = frame(k, depth=noise.integers(500, 4000, (240, 320), np.uint16))
+        recorder.after(replace(large, camera=camera), UpdateReport())
+    recorder.close()
+    (left,) = tmp_path.glob("log.mcap.*.unfinished/log/log.mcap")
+    assert said == [
+        f"log.mcap: cannot be written (No space left on device); what was recorded before is in "
+        f"{left.relative_to(tmp_path)}, mapping goes on"
+    ]
+    assert 10 < len(open_source(left)) <= 20  # the last megabyte may be missing
+
+
+def test_what_is_written_is_flushed_to_the_disk_now_and_then(tmp_path, monkeypatch):
+    flushed = threading.Event()
+
+    def note(file):
+        if file.suffix == ".mcap":
+            flushed.set()
+
+    monkeypatch.setattr("stereovox.live.recorder.SYNC_S", 0.01)
+    monkeypatch.setattr("stereovox.sources.bags.writer.sync_file", note)
+    recorder = Recorder(tmp_path / "log.mcap", {"front": T_BODY_OPTICAL})
+    recorder.after(frame(0), UpdateReport())
+    assert flushed.wait(10)
+    recorder.close()
+
+
+KILLED = """
+import sys
+import numpy as np
+from stereovox import Frame, PinholeCamera
+from stereovox.sources.bags.writer import BagWriter
+
+camera, noise = PinholeCamera(320, 240, 200.0, 200.0, 159.5, 119.5), np.random.default_rng(0)
+with BagWriter(sys.argv[1]) as bag:
+    for k in range(40):
+        depth = noise.integers(500, 4000, (240, 320), np.uint16)
+        bag.depth(Frame(depth, camera, np.eye(4), 10**18 + k * 33_000_000, 0.001))
+        bag.transform(10**18 + k * 33_000_000, "map", "camera_depth_optical_frame", np.eye(4))
+    print("written", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_recording_is_not_lost_by_a_kill(tmp_path):
+    file = tmp_path / "log.mcap"
+    with Popen([sys.executable, "-c", KILLED, file], stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdout.readline() == b"written\n"
+        process.kill()
+    with pytest.raises(SourceError, match=r"a recording that was cut off: (.*)") as told:
+        open_source(file)
+    again = open_source(told.value.args[0].rpartition("cut off: ")[2].removesuffix(")"))
+    assert 30 < len(again) <= 40
+    assert not next(iter(again)).fault
 
 
 def test_images_without_a_pose_are_recorded_too(tmp_path):

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Full, Queue
 from threading import Event, Thread
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,8 @@ WORLD, BODY = "odom", "base_link"
 """Frames of the recording, as REP 105 names them: poses may drift."""
 WAITING = 60
 """Images that wait to be written; more are not recorded, and counted."""
-LOOK_S = 0.2
+LOOK_S, SYNC_S = 0.2, 5.0
+"""Seconds between looks for the end, and after which what is written is safe from a loss of power."""
 ENDINGS = (".mcap", ".bag", ".db3")
 
 
@@ -38,7 +40,8 @@ class Recorder:
     these. Images that the map refused are recorded, too.
 
     Args:
-        file: `.mcap`, `.bag` or `.db3`; it is complete at the end, and there is none before.
+        file: `.mcap`, `.bag` or `.db3`; it is complete at the end, and there is none before. An `.mcap` grows in
+            `FILE.mcap.XXXXXX.unfinished/`, from where it can be read after a kill or a full disk.
         mounts: T_body_camera (4, 4) by the name of the sensor.
         imus: IMUs by the name of the sensor.
         notify: Called with a line where something cannot be recorded.
@@ -96,21 +99,31 @@ class Recorder:
         try:
             for name, T_body_camera in self._mounts.items():
                 self._bag.fixed(BODY, optical(name), T_body_camera)
+            due_s = monotonic() + SYNC_S
             while True:
                 try:
                     self._write(self._queue.get(timeout=LOOK_S))
                 except Empty:
                     if self._ended.is_set():
                         break
+                if monotonic() > due_s:
+                    self._bag.sync()
+                    due_s = monotonic() + SYNC_S
             if self.counts["images"]:
                 self._bag.__exit__(None, None, None)
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
         except Exception as error:  # whatever it is, the user is told, and nobody waits for this thread
-            self._bag.__exit__(type(error), error, None)
             why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
-            self._notify(f"{why}; nothing is recorded, mapping goes on")
+            self._notify(f"{why}; {self._left()}, mapping goes on")
             self._drain()
+
+    def _left(self) -> str:
+        """Say what is left of a recording that ended early, and leave it."""
+        left = self._bag.leave() if self.counts["images"] else ""
+        if not left:
+            self._bag.__exit__(StereovoxError, None, None)
+        return f"what was recorded before is in {left}" if left else "nothing is recorded"
 
     def _write(self, frame: Frame) -> None:
         name, stamp_ns = frame.sensor, frame.stamp_ns

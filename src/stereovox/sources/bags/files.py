@@ -8,7 +8,9 @@ because in the usual readers a hostile file sizes the buffers.
 
 from __future__ import annotations
 
+import os
 import re
+from glob import escape, glob
 from pathlib import Path
 from typing import Protocol
 
@@ -19,6 +21,8 @@ from stereovox.sources.bags.messages import Wire
 
 MAX_BYTES = 256 * 1024 * 1024
 """Largest message or chunk after decompression; anything larger is treated as damaged."""
+UNFINISHED = ".unfinished"
+"""How a folder's name ends in which a recording grows; what a killed writer leaves there can be read in an `.mcap`."""
 
 
 class BagFile(Protocol):
@@ -68,3 +72,9 @@ def one_line(error: object) -> str:
     """Return the text of an error or name on one line, without a full stop."""
     plain = re.sub(r"\('(.*?)',?\)", r"\1", str(error))  # some print the arguments of an exception as they are
     return " ".join(plain.split()).rstrip(".") or f"damaged ({type(error).__name__})"
+
+
+def cut_off(path: str) -> str:
+    """Return the file that a killed writer of a recording left, empty where it left none."""
+    pattern = f"{escape(path)}.*{UNFINISHED}/*/{escape(os.path.basename(path))}"
+    return max(glob(pattern), default="", key=os.path.getmtime)

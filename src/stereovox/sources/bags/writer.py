@@ -23,7 +23,7 @@ from stereovox.safe_io import sync_file, sync_folder, sync_tree
 from stereovox.se2 import lifted
 from stereovox.se3 import Transform, rigidity_error
 from stereovox.sources.bags.depth_topic import sibling
-from stereovox.sources.bags.files import one_line
+from stereovox.sources.bags.files import UNFINISHED, one_line
 from stereovox.sources.bags.writer_messages import Messages, metres, millimetres, packed_png
 
 SECONDS = {1: 2**32, 2: 2**31}
@@ -77,6 +77,14 @@ class BagWriter:
             self._file.abort()
             raise
         self._file.finish()
+
+    def sync(self) -> None:
+        """Flush what was written to the disk, so that no loss of power takes it; all but the last megabyte."""
+        self._file.sync()
+
+    def leave(self) -> str:
+        """End a recording that cannot be completed; return which file has what was written, nothing where none has."""
+        return self._file.leave()
 
     def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
         """Write a `sensor_msgs/LaserScan`; write its mount and the robot's poses with `fixed` and `odometry`."""
@@ -257,7 +265,7 @@ class BagFileWriter:
         self._connections: dict[str, Any] = {}
         self._writer: Any = None
         self._target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
-        self._folder = self._target.with_name(f".{uuid.uuid4().hex[:12]}.new")
+        self._folder = self._target.with_name(f"{self._target.name[:100]}.{uuid.uuid4().hex[:6]}{UNFINISHED}")
         self._check()
 
     def open(self) -> None:
@@ -301,6 +309,23 @@ class BagFileWriter:
                 self._move()
         finally:
             self.abort()
+
+    def sync(self) -> None:
+        """Flush what was written to the disk."""
+        for file in self._folder.rglob("*.*"):
+            with suppress(OSError):  # SQLite's journal may be gone by now; a broken disk fails at the next message
+                sync_file(file)
+
+    def leave(self) -> str:
+        """End the recording where it is, and return the file that can be read; without one, as `abort`."""
+        grown = self._folder / self._target.stem / self._target.name
+        if self._ending != ".mcap" or not grown.is_file():
+            self.abort()
+            return ""
+        with suppress(Exception):
+            self._writer.abort()
+        self._writer = None
+        return str(self.path.parent / grown.relative_to(self._target.parent))
 
     def abort(self) -> None:
         """Discard the recording; an older file stays intact."""

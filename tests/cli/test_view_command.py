@@ -124,7 +124,7 @@ def test_a_taken_port_is_one_line(saved, capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
-    assert "this port is in use; give another one (--port" in captured.err
+    assert "this port is in use; give another one, as 8081" in captured.err
 
 
 def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys, monkeypatch):

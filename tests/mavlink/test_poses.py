@@ -157,12 +157,40 @@ def test_nothing_is_taken_before_the_clock_is_known(quiet):
     assert receiver.passed_over == {"clock": 1}
 
 
-def test_a_reset_is_told(quiet):
+def flying(ms, start_deg=0.0, origin=(0.0, 0.0, 0.0), resets=0):
+    """ODOMETRY of a vehicle that flies at 2 m/s and turns by 30 degrees a second, in a world turned and shifted."""
+    along, turned_deg = 0.002 * ms, 0.03 * ms
+    yaw, start = math.radians(start_deg + turned_deg), math.radians(start_deg)
+    north, east = origin[0] + along * math.cos(start), origin[1] + along * math.sin(start)
+    q = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+    return odometry(1001 + ms / 1000, q=q, xyz=(north, east, origin[2]), resets=resets)
+
+
+def test_poses_go_on_after_a_reset(quiet):
     link, taken, told, _ = quiet
-    link.put(odometry())
-    link.put(odometry(seconds=1001.02, resets=1), 20_000_000)
-    assert len(taken.poses) == 2
-    assert "was reset" in told[0]
+    elsewhere = {"start_deg": 70.0, "origin": (-20.0, 8.0, 1.5), "resets": 1}
+    again = {"start_deg": -130.0, "origin": (3.0, 3.0, 0.0), "resets": 2}
+    for ms in range(0, 200, 20):
+        link.put(flying(ms, **({} if ms < 60 else elsewhere if ms < 120 else again)), ms * 1_000_000)
+    plain, straight = QuietLink(), Taken()
+    PoseReceiver(plain, straight)
+    for ms in range(0, 200, 20):
+        plain.put(flying(ms), ms * 1_000_000)
+    assert len(taken.poses) == 10
+    for (stamp_ns, T, *_), (expected_ns, expected, *_) in zip(taken.poses, straight.poses, strict=True):
+        assert stamp_ns == expected_ns
+        np.testing.assert_allclose(T, expected, atol=1e-5)
+    assert [line.rpartition(": ")[2] for line in told] == ["poses go on from those before it"] * 2
+
+
+@pytest.mark.parametrize("before_ms", [[0], [0, 100]])
+def test_poses_jump_after_a_reset_where_nobody_knows_what_was_before(quiet, before_ms):
+    link, taken, told, _ = quiet
+    for ms in before_ms:
+        link.put(flying(ms), ms * 1_000_000)
+    link.put(flying(700, origin=(5.0, 0.0, 0.0), resets=1), 700_000_000)
+    assert taken.poses[-1][1][0, 3] == pytest.approx(6.4)
+    assert [line.partition(": ")[2] for line in told] == ["poses jump, and what is mapped stays where it is"]
 
 
 def test_odometry_is_preferred_to_the_local_position(quiet):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
+from stereovox.se2 import lifted
 from stereovox.se3 import Transform, from_quaternion, interpolate
 from stereovox.sources.tracker import turned
 
@@ -30,6 +31,8 @@ OLDEST_NS, NEWEST_NS = 2_000_000_000, 50_000_000
 """How old a pose may be when it comes, and how far ahead of this machine's clock; else the clocks do not agree."""
 PREFERRED_NS = 1_000_000_000
 """While ODOMETRY, or ATTITUDE_QUATERNION, came within this time, LOCAL_POSITION_NED, or ATTITUDE, is passed over."""
+LONGEST_RESET_NS = 500_000_000
+"""Between the poses before and after a reset, for where the vehicle went meanwhile to be known."""
 MAX_LENGTH_ERROR = 0.01
 """By which the length of a quaternion may differ from 1."""
 
@@ -45,11 +48,16 @@ class TakesPoses(Protocol):
 class PoseReceiver:
     """Hands the poses that an autopilot sends to `into`, stamped by this machine's clock.
 
+    Where ODOMETRY says that the autopilot's estimate was reset (`reset_counter`), the poses after it are shifted and
+    turned about the vertical so that they go on from those before it: what is mapped stays right, in a world that is
+    no longer the autopilot's. So it is told, and also where too much time passed for that.
+
     Args:
         connection: A `MavlinkLink`, or the address of one, which is then closed with the receiver.
         into: Its `add(stamp_ns, T_world_body)` is called by the thread that reads. T_world_body (4, 4) maps the
             vehicle's body (optical axes: x right, y down, z forward) into a world x north, y west, z up, with the
-            autopilot's origin. stamp_ns: when the vehicle was there, by the clock of the link.
+            autopilot's origin, or the one it had before a reset. stamp_ns: when the vehicle was there, by the clock of
+            the link.
         tell: Called with one line when poses cannot be used, why, once for each reason.
 
     Attributes:
@@ -68,6 +76,8 @@ class PoseReceiver:
         self.taken = 0
         self.passed_over: dict[str, int] = {}
         self._resets: int | None = None
+        self._was_reset, self._T_world_autopilot = False, np.eye(4)
+        self._recent: deque[tuple[int, Transform]] = deque(maxlen=2)
         self._last_odometry_ns = self._last_quaternion_ns = -PREFERRED_NS - 1
         self._attitudes: deque[tuple[int, Transform]] = deque(maxlen=ATTITUDES)
         self._position: tuple[int, NDArray[np.float64], int] | None = None
@@ -105,8 +115,7 @@ class PoseReceiver:
             return self._pass_over("frame", f"ODOMETRY is in frames {frames}; LOCAL_NED (1) or LOCAL_FRD (20) is read")
         if message.quality == -1:
             return self._pass_over("quality", "the autopilot says that its odometry has failed")
-        if self._resets not in (None, message.reset_counter):
-            self._tell("the autopilot's position was reset: poses jump, and what is mapped stays where it is")
+        self._was_reset |= self._resets not in (None, message.reset_counter)
         self._resets = message.reset_counter
         T = _pose([message.x, message.y, message.z], message.q)
         self._hand_on(message.time_usec * 1000, T, came_ns)
@@ -160,8 +169,28 @@ class PoseReceiver:
         if not -NEWEST_NS <= came_ns - stamp_ns <= OLDEST_NS:
             age_s = (came_ns - stamp_ns) / 1e9
             return self._pass_over("stamp", f"poses seem to be {age_s:.2f} s old; are their times those of TIMESYNC?")
+        T_autopilot_body = turned(T_ned_frd[None], "ned", "up")[0]
+        if self._was_reset:
+            self._was_reset = False
+            self._go_on(stamp_ns, T_autopilot_body)
+        T_world_body = self._T_world_autopilot @ T_autopilot_body
+        self._recent.append((stamp_ns, T_world_body))
         self.taken += 1
-        self._into.add(stamp_ns, turned(T_ned_frd[None], "ned", "up")[0])
+        self._into.add(stamp_ns, T_world_body)
+
+    def _go_on(self, stamp_ns: int, T_autopilot_body: Transform) -> None:
+        """Take the body for where it would have been without the reset, by its last two poses, and turned so."""
+        words = "the autopilot's position was reset"
+        (first_ns, first), (then_ns, then) = (self._recent[0], self._recent[-1]) if self._recent else ((0, None),) * 2
+        if first is None or then is None or stamp_ns - first_ns > LONGEST_RESET_NS or not then_ns > first_ns:
+            self._tell(f"{words}: poses jump, and what is mapped stays where it is")
+            return
+        expected = interpolate(first, then, (stamp_ns - first_ns) / (then_ns - first_ns))
+        R = expected[:3, :3] @ T_autopilot_body[:3, :3].T
+        T = lifted((0.0, 0.0, np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])))
+        T[:3, 3] = expected[:3, 3] - T[:3, :3] @ T_autopilot_body[:3, 3]
+        self._T_world_autopilot = T
+        self._tell(f"{words}: poses go on from those before it")
 
     def _pass_over(self, reason: str, line: str) -> None:
         self.passed_over[reason] = self.passed_over.get(reason, 0) + 1

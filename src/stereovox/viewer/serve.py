@@ -73,7 +73,7 @@ def find_address(host: str, port: int) -> Address:
             probe.bind(address)
     except (OSError, UnicodeError) as error:
         cures = {
-            errno.EADDRINUSE: "in use; give another one (--port 8081), or --port 0 for any that is free",
+            errno.EADDRINUSE: "in use; give another one, as 8081, or 0 for any that is free",
             errno.EACCES: "reserved; give one above 1023",
         }
         if (number := getattr(error, "errno", None)) in cures:
@@ -206,7 +206,7 @@ def serve(name: str, address: Address, guard: Guard) -> ViserServer:
     port = server.get_port()
     if address.port and port != address.port:
         stop(server)
-        raise StereovoxError(f"{address.host}:{address.port}: this port is in use; give another one (--port {port})")
+        raise StereovoxError(f"{address.host}:{address.port}: this port is in use; give another one, as {port}")
     if not _is_guarded(address.number, port):
         stop(server)
         raise StereovoxError(f"viser {viser.__version__} would show the map to anyone; install viser 1.1")

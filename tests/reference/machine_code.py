@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Machine code of kernels for processors other than this one, AArch64 among them: compiled and read, never run.
 
-`listings` runs a program in a process of its own and returns what the kernels it called become on other processors.
+`listings` runs a program in a process of its own and returns what the kernels it compiled become on other processors;
+`alone` makes of a program that calls kernels one that compiles just those of interest, most of the time saved.
 What numba hands to LLVM hardly depends on the processor; so it is kept as it is there, and numba's own optimisation
 is repeated with another target. `loops` finds the innermost loops of a listing, `arithmetic` counts what one divides
 and multiplies, many numbers at once or one by one.
@@ -36,6 +37,18 @@ NEOVERSE_N1 = Processor("neoverse-n1", "aarch64-linux-gnu")
 CORTEX_A72 = Processor("cortex-a72", "aarch64-linux-gnu")
 """Haswell and Zen 3 have AVX2, the next two AVX-512, the last two (servers; Raspberry Pi 4) NEON."""
 
+CALLS = """
+import json, pickle, sys
+import machine_code
+job = json.loads(sys.argv[1])
+exec(job["program"])
+lines = ["import importlib, pickle"]
+for name in job["kernels"]:
+    for signature in machine_code.find(name).signatures:
+        types = f"pickle.loads({pickle.dumps(signature)!r})"
+        lines.append("getattr(importlib.import_module({!r}), {!r}).compile({})".format(*name.split(":"), types))
+print(json.dumps("\\n".join(lines)))
+"""
 CHILD = """
 import json, os, sys
 import machine_code
@@ -54,13 +67,21 @@ print(json.dumps([
 def listings(program: str, kernels: list[str], processors: Iterable[Processor]) -> list[dict[str, str]]:
     """Run Python code in another process; return the assembly of each kernel in the order of the processors.
 
-    kernels: `module:name` each; `program` must have called them, so that their arguments' types are known.
+    kernels: `module:name` each; `program` must have called or compiled them, so that their arguments' types are known.
     """
-    job = {"program": program, "kernels": kernels, "processors": list(processors)}
+    return _answer(CHILD, {"program": program, "kernels": kernels, "processors": list(processors)})
+
+
+def alone(program: str, kernels: list[str]) -> str:
+    """Run Python code in another process; return code that compiles the kernels that it called, for such arguments."""
+    return _answer(CALLS, {"program": program, "kernels": kernels})
+
+
+def _answer(code: str, job: dict[str, Any]) -> Any:
     here = str(Path(__file__).parent)
     path = os.pathsep.join([here, *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path}
-    command = [sys.executable, "-B", "-c", CHILD, json.dumps(job)]
+    command = [sys.executable, "-B", "-c", code, json.dumps(job)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])

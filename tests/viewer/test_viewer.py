@@ -342,7 +342,9 @@ def test_names_from_a_map_are_no_program_text():
 def test_a_taken_port_is_named_with_its_cure():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(StereovoxError, match=rf"127.0.0.1:{port}: this port is in use; give another one, as 8081, or 0"):
+        with pytest.raises(
+            StereovoxError, match=rf"127.0.0.1:{port}: this port is in use; give another one, as 8081, or 0"
+        ):
             open_viewer(box_map(), port=port)
 
 

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.optimize import approx_fprime, least_squares
 
 from stereovox import se2
-from stereovox.errors import MissingExtra
+from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.pose_graph import HELD, LITTLE, OUTLIER, Edge, PoseGraph, Position, Upright, need_gtsam
 from stereovox.se3 import inverse, rotation_matrix, rotation_vector
 
@@ -275,3 +275,11 @@ def test_a_long_loop_in_the_plane_is_closed(with_wrong):
     found = PoseGraph(start, steps, loops).poses
     assert np.hypot(*(found - true)[-1, :2]) < 0.05
     assert np.hypot(*(found - true)[:, :2].T).max() < 0.25
+
+
+def test_a_graph_that_cannot_be_solved_is_told_in_one_line():
+    edges = [Edge(i, i + 1, np.eye(4), np.diag([1e-30] * 5 + [1e30])) for i in range(3)]
+    graph = PoseGraph(np.array([np.eye(4)] * 4), edges, [Edge(0, 3, np.eye(4), 1e-30 * np.eye(6))])
+    with pytest.raises(StereovoxError, match=r"cannot be solved: .* give poses in metres") as caught:
+        graph.covariances([0], 3)
+    assert "\n" not in str(caught.value)

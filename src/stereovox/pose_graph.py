@@ -7,7 +7,8 @@ covariances are those of a small motion (3,) x, y, yaw or (6,) rotation, shift, 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.errors import MissingExtra
+from stereovox.errors import MissingExtra, StereovoxError
 
 OUTLIER = 3.0
 """Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
@@ -75,6 +76,7 @@ class PoseGraph:
 
     Raises:
         MissingExtra: gtsam is not installed.
+        StereovoxError: What joins the poses cannot be solved for, since some of it is known far better than the rest.
     """
 
     def __init__(
@@ -103,7 +105,8 @@ class PoseGraph:
             self._graph.add(self._alone(other, np.asarray(world_up, float)))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(MAX_ITERATIONS)
-        self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, values, parameters).optimize()
+        with _solvable():
+            self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, values, parameters).optimize()
         at = getattr(self._values, f"at{self._kind}")
         self.poses = np.array([_numbers(at(i)) for i in range(len(poses))])
 
@@ -117,7 +120,8 @@ class PoseGraph:
         Returns:
             (3, 3) or (6, 6) for each of `firsts`.
         """
-        marginals = self._gtsam.Marginals(self._graph, self._values)
+        with _solvable():
+            marginals = self._gtsam.Marginals(self._graph, self._values)
         found = []
         at = getattr(self._values, f"at{self._kind}")
         for first in firsts:
@@ -154,6 +158,20 @@ class PoseGraph:
 
 def _numbers(pose: Any) -> Any:
     return (pose.x(), pose.y(), pose.theta()) if hasattr(pose, "theta") else pose.matrix()
+
+
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """Say in one line what gtsam says in a paragraph."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "ndeterminate linear system" not in str(error):
+            raise
+        raise StereovoxError(
+            "the graph of poses cannot be solved: some are held far more firmly than others; give poses in metres and "
+            "standard deviations that are not nearly 0"
+        ) from None
 
 
 def need_gtsam() -> None:

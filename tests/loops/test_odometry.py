@@ -9,7 +9,8 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.loops.closer import LoopCloser
 from stereovox.loops.drift import difference, moved_by
-from stereovox.loops.odometry import Odometry
+from stereovox.loops.odometry import MAX_OFF_M, Odometry
+from stereovox.pose_graph import information
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.simulation import Simulation
 from stereovox.sources.poses import Poses
@@ -93,4 +94,16 @@ def test_odometry_of_another_time_is_refused():
     assert np.array_equal(motion, np.eye(4))
     assert np.array_equal(covariance, np.eye(6))
     with pytest.raises(StereovoxError, match=r"wheels.tum: has no poses at the times"):
+        odometry.check()
+
+
+def test_odometry_in_another_unit_is_refused_and_can_be_solved_until_then():
+    """Steps of 50 km where the camera moved by 0.5 m: all would be held by nothing."""
+    config, far = load_config().loops, np.eye(4)
+    far[0, 3] = 5e4
+    odometry = Odometry(Poses([0, 10], [np.eye(4), far], where="wheels.tum"), config)
+    _, covariance = odometry.joined((0, 10), np.eye(4), 1e-6 * np.eye(6), (0.5, 0.0))
+    assert np.linalg.eigvalsh(information(covariance)).min() > 0
+    assert np.linalg.eigvalsh(covariance)[-1] < 1.1 * MAX_OFF_M**2
+    with pytest.raises(StereovoxError, match=r"wheels.tum: contradicts the map's poses in 1 of 1 steps.*in metres"):
         odometry.check()

@@ -12,6 +12,9 @@ from stereovox.loops.drift import GATE, Drift, difference, moved_by, squared
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.poses import Poses
 
+MAX_OFF_M = 100.0
+"""Metres by which a contradiction counts at most: a step is held by nothing there, and numbers can still be solved."""
+
 
 class Odometry:
     """Poses (T_any_camera) of a second odometry.
@@ -52,15 +55,22 @@ class Odometry:
         together = covariance + self._drift.covariance(*way)
         if squared(moved, together) > GATE:
             self.contradicted += 1
+            moved[3:] *= min(1.0, MAX_OFF_M / max(float(np.linalg.norm(moved[3:])), MAX_OFF_M))
             return motion, covariance + np.outer(moved, moved)
         self.used += 1
         gain = np.linalg.solve(together, covariance).T
         return moved_by(motion, gain @ moved), covariance - gain @ covariance
 
     def check(self) -> None:
-        """Raise StereovoxError where it was of no use at all."""
-        if not self.used + self.contradicted:
+        """Raise StereovoxError where it was of no use at all, or is of another way or in another unit."""
+        steps = self.used + self.contradicted
+        if not steps:
             raise StereovoxError(f"{self.where}: has no poses at the times of the map's frames; give those of this way")
+        if self.contradicted > self.used:
+            raise StereovoxError(
+                f"{self.where}: contradicts the map's poses in {self.contradicted} of {steps} steps between places; "
+                "give poses of the camera, in metres, of this way, or say how far they drift (loops.odometry_drift)"
+            )
 
     def summary(self) -> dict[str, int]:
         """Return its numbers for programs."""

@@ -12,7 +12,8 @@ from made_threads import frames_of
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.joining import why_added
+from stereovox.joining import _follow, why_added
+from stereovox.loops.closer import check_one_way
 from stereovox.products.merge import merge as added
 from stereovox.se3 import rotation_matrix
 
@@ -124,6 +125,9 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
     assert joined.map.recording == "walk, poses corrected"  # it cannot be gone on with
     assert joined.map.history.loops.counts()["closed"] == joined.loops
     assert np.linalg.norm((joined.T_a_b @ ELSEWHERE)[:3, 3]) < 0.6  # both have drifted
+    assert joined.map.history.recordings == 2  # their times overlap: no third one is sought in them as in one way
+    with pytest.raises(StereovoxError, match="merged of 2 recordings"):
+        sv.join(joined.map, b)
     kept = joined.map.kept_frames.frames
     np.testing.assert_allclose(kept[0].T_world_sensor, a.kept_frames.frames[0].T_world_sensor, atol=0.05)
     assert len(kept) == len(a.kept_frames) + len(b.kept_frames)
@@ -137,3 +141,19 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
 def test_a_recording_that_kept_no_frames_is_not_sought():
     with pytest.raises(StereovoxError, match="only by frames, and a map did not keep its frames"):
         sv.join(mapped(frames()), mapped(frames(), **{"map.keep_frames": False}))
+
+
+def test_recordings_of_which_one_came_after_the_other_are_one_way():
+    first, second = (mapped(some).kept_frames.frames for some in (frames()[:3], frames()[3:6]))
+    assert _follow(first, second)
+    assert _follow(second, first)
+    assert not _follow(first, first)
+    assert not _follow([first[0], first[2]], [first[1]])
+    assert not _follow([first[1]], [first[0], first[2]])
+
+
+def test_frames_that_have_one_stamp_are_no_way():
+    repeated = [replace(frame, stamp_ns=7) for frame in frames(4)]
+    voxel_map = mapped(repeated, **{"trust.ordered": False})
+    with pytest.raises(StereovoxError, match=r"frames of camera 0 have the stamp 7; loops are closed of frames"):
+        check_one_way(voxel_map.history, voxel_map.kept_frames.frames)

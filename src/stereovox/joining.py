@@ -87,9 +87,19 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
         for kept, found in zip((a.kept_frames, b.kept_frames), poses, strict=True)
     ]
     joined = _of_frames(a, b, *frames)
-    joined.recording, joined.history.recordings = as_corrected(joined.recording), 1
+    joined.recording = as_corrected(joined.recording)
+    if _follow(*frames):
+        joined.history.recordings = 1
     joined.history.loops = LoopLines.between(*(ends_of(found, first.places) for found in (first.loops, first.refused)))
     return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
+
+
+def _follow(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> bool:
+    """Return whether all frames of one recording are earlier than those of the other, so that both are one way."""
+    (first_a, last_a), (first_b, last_b) = (
+        (min(stamps), max(stamps)) for stamps in ([frame.stamp_ns for frame in frames] for frames in (a, b))
+    )
+    return last_a < first_b or last_b < first_a
 
 
 def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:

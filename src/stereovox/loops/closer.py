@@ -8,6 +8,7 @@ submaps that see the same are laid onto each other.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -392,7 +393,13 @@ def check_one_way(history: History, frames: Sequence[KeptFrame]) -> None:
     if history.recordings > 1:
         raise StereovoxError(
             f"the map was merged of {history.recordings} recordings, which are no single way of a camera; close the "
-            "loops of each, and merge them with --find"
+            "loops of each, and merge them with --find, more than two only where one was made after the other"
+        )
+    times = Counter((frame.sensor, frame.stamp_ns) for frame in frames)
+    (sensor, stamp_ns), most = times.most_common(1)[0]
+    if most > 1:
+        raise StereovoxError(
+            f"{most} frames of {sensor} have the stamp {stamp_ns}; loops are closed of frames with a time of their own"
         )
     lidar = next((frame for frame in frames if isinstance(frame.camera, Lidar)), None)
     if lidar is not None:

@@ -124,7 +124,7 @@ class History:
         imported: The file of another program that the map began with; None where there was none.
         loops: The loops that were closed; None where none were sought, or poses were corrected otherwise since.
         recordings: Number of recordings that were merged as their poses said; 1 where none were, or `join` made one way
-            of them.
+            of them, which it can where one was made after the other.
     """
 
     frames: int = 0

@@ -161,6 +161,12 @@ def test_a_map_of_clouds_that_was_saved_is_corrected_as_new(kind, tmp_path):
     mapper.close()
 
 
+def test_a_lidar_of_numpy_numbers_is_saved_with_its_clouds(tmp_path):
+    lidar = sv.Lidar(sigma=np.float32(0.03), range_max=np.float32(30))
+    mapped([replace(room_cloud(0, 3000), lidar=lidar)], voxel_size=0.2).save(tmp_path / "m.svox")
+    assert sv.load_map(tmp_path / "m.svox").kept_frames.frames[0].camera == lidar
+
+
 def test_loops_of_clouds_are_not_sought_and_that_is_said(tmp_path):
     mapped(made_clouds(), voxel_size=0.2).save(tmp_path / "m.svox")
     with pytest.raises(StereovoxError, match=r"cloud 0: loops are sought among depth images.*stereovox remap"):

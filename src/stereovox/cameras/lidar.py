@@ -38,6 +38,8 @@ class Lidar:
     height: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
+        for name in ("sigma", "range_min", "range_max"):  # NumPy's float32 cannot be saved with kept clouds
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not 0 < self.sigma < inf:
             raise StereovoxError(f"lidar: sigma {self.sigma:g} must be more than 0 metres")
         if not 0 <= self.range_min < self.range_max:

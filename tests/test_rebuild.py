@@ -433,6 +433,7 @@ def test_stamps_of_several_sensors_need_their_name():
     assert is_as_new(mapper, moved)
     repeated = mapped([frames[0], frames[2], replace(frames[2])], **{"trust.ordered": False})
     assert "without such" in refused(repeated, {(frame.sensor, frame.stamp_ns): T})
+    assert f"('{frame.sensor}'); only maps without such" in refused(repeated, {frame.stamp_ns: T})
 
 
 def test_a_corrected_map_that_needs_too_much_memory_is_refused():
@@ -464,3 +465,28 @@ def test_in_a_real_kitchen(seed, share, settings):
     moved, poses = shaken(frames, seed, share)
     mapper.correct(poses)
     assert is_as_new(mapper, moved, **settings)
+
+
+def test_a_frame_with_two_poses_is_refused():
+    frames = [frame for frame in made_frames(each=4) if not frame.fault]
+    mapper = mapped(frames)
+    one, other = frames[1].T_world_sensor.copy(), frames[1].T_world_sensor.copy()
+    one[0, 3], other[0, 3] = one[0, 3] + 0.1, other[0, 3] + 0.5
+    key = frames[1].sensor, frames[1].stamp_ns
+    assert "two poses" in refused(mapper, {frames[1].stamp_ns: one, key: other})
+    assert "two poses" in refused(mapper, {key: other, frames[1].stamp_ns: one})
+
+
+def test_a_map_counts_as_corrected_before_its_listeners_hear_of_it():
+    """Else a checkpoint that another thread writes then, or a listener that fails, leaves a map to be gone on with."""
+    frames = [frame for frame in made_frames(each=4) if not frame.fault]
+    mapper = mapped(frames)
+    mapper.map.recording = "walk"
+
+    def fail(evidence):
+        raise KeyboardInterrupt
+
+    mapper.map.listeners.append(fail)
+    with pytest.raises(KeyboardInterrupt):
+        mapper.correct(shaken(frames, 0, 1.0)[1])
+    assert mapper.map.recording == "walk, poses corrected"

@@ -26,7 +26,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.rebuild import CorrectionReport, FramePoses, as_corrected, correct
+from stereovox.rebuild import CorrectionReport, FramePoses, correct
 from stereovox.threads import MapLock
 from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
@@ -188,10 +188,7 @@ class Mapper:
         """
         self.map.lock.refuse_holder("poses cannot be corrected")
         with self._correcting:
-            report = correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
-            if report.moved:
-                self.map.recording = as_corrected(self.map.recording)
-            return report
+            return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
     def expect(self, frame: AnyFrame) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.

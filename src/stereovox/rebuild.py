@@ -144,11 +144,17 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
         )
     moved: dict[int, Transform] = {}
     for key, found in named.items():
+        frame, sensors = found[0], sorted({frame.sensor for frame in found})
         if len(found) > 1:
-            cure = "only maps without such can be corrected" if isinstance(key, tuple) else "name them (sensor, stamp)"
-            sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
-            raise StereovoxError(f"{len(found)} frames have the stamp {found[0].stamp_ns} ({sensors}); {cure}")
-        frame = found[0]
+            is_same = len(sensors) < len(found)
+            cure = "only maps without such can be corrected" if is_same else "name them (sensor, stamp)"
+            names = ", ".join(f"'{sensor}'" for sensor in sensors)
+            raise StereovoxError(f"{len(found)} frames have the stamp {frame.stamp_ns} ({names}); {cure}")
+        if (frame.sensor, frame.stamp_ns) in named and key == frame.stamp_ns:
+            raise StereovoxError(
+                f"the frame of '{frame.sensor}' at {frame.stamp_ns} ns has two poses, one by its stamp and one by "
+                "sensor and stamp; give one"
+            )
         posed = Frame(np.empty((0, 0), np.float32), FORWARD, given[key], name=frame.name)
         rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none
         if not np.array_equal(given[key], frame.T_world_sensor):
@@ -225,8 +231,11 @@ class Rebuild:
         """Put what was made into the map, tell its listeners and return what was done. The lock must be held."""
         changed, self._is_in_place = self._swap(), True
         before, after = ([(frame.sensor, frame.seen) for frame in frames] for frames in (self._before, self._after))
-        correct_history(self._storage.history, before, after)
         self._kept.replace(self._after)
+        history = self._storage.history
+        correct_history(history, before, after)
+        if self._moved:
+            history.recording = as_corrected(history.recording)
         blocks, none = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
         for listener in self._storage.listeners:
             listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, none))

@@ -14,7 +14,7 @@ from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.matching import Match
 from stereovox.loops.positions import Positions
 from stereovox.products.moved import moved
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.sources.trajectory import Trajectory, write_trajectory
 from stereovox.trust.loop_lines import LoopLines
 
 MATCH = Match(np.eye(4), np.eye(6), 0.9, True)
@@ -201,3 +201,16 @@ def test_a_second_odometry_and_fixes_of_a_bag_hold_the_way(tmp_path):
 
 def length(poses):
     return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
+
+
+def test_the_trajectory_of_a_rig_is_that_of_one_camera(frames, closure, tmp_path):
+    """Poses of several would be taken for one way by whoever reads them, `remap` too."""
+    second = np.arange(len(frames)) % 2 == 1
+    rig = replace(closure, sensors=["rear" if one else "front" for one in second])
+    rig.save(tmp_path / "way.tum")
+    written = Trajectory(tmp_path / "way.tum")
+    assert written.stamps_ns.tolist() == closure.stamps_ns[~second].tolist()
+    np.testing.assert_allclose(written.T_world_body, closure.T_world_sensor[~second], atol=1e-5)
+    assert list(closure.sensors) == ["camera"] * len(frames)
+    closure.save(tmp_path / "all.tum")
+    assert len(Trajectory(tmp_path / "all.tum")) == len(frames)

@@ -46,6 +46,7 @@ class LoopClosure:
         anchors: (S,) int64, numbers of the frames in the middle of all places.
         report: What the correction did to the map.
         odometry: The second odometry, and for how many steps it was of use; None where there is none.
+        sensors: Which sensor took each of the N frames; empty where there is but one.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -56,6 +57,7 @@ class LoopClosure:
     anchors: NDArray[np.int64]
     report: CorrectionReport
     odometry: Odometry | None = None
+    sensors: Sequence[str] = ()
 
     @property
     def moved_m(self) -> NDArray[np.float64]:
@@ -87,6 +89,8 @@ class LoopClosure:
     def save(self, path: str | Path) -> None:
         """Write the corrected poses as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.
 
+        Of several sensors those of the one that took the first frame: a file is the way of one.
+
         Args:
             path: The file, `.tum` or `.txt`.
 
@@ -95,7 +99,9 @@ class LoopClosure:
             MapFileError: It cannot be written; an older one is then still there.
         """
         file = check_file(str(path), TRAJECTORY_ENDINGS)
-        write_trajectory(file, self.stamps_ns.tolist(), self.T_world_sensor, "camera (x right, y down, z forward)")
+        own = np.array([sensor == self.sensors[0] for sensor in self.sensors] or [True] * len(self.stamps_ns))
+        camera = "camera (x right, y down, z forward)"
+        write_trajectory(file, self.stamps_ns[own].tolist(), self.T_world_sensor[own], camera)
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox loops --json`, besides those of the map."""
@@ -242,6 +248,7 @@ def close(
         _anchors(closer.submaps),
         report,
         odometry,
+        [frame.sensor for frame in frames],
     )
     with mapper.map.lock:
         mapper.map.history.loops = closure.lines

@@ -63,6 +63,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say_closure(done.closure)
     if arguments.trajectory:
         done.closure.save(arguments.trajectory)
+        if len(set(done.closure.sensors)) > 1:
+            say(f"note: {arguments.trajectory} holds the poses of '{done.closure.sensors[0]}' (remap --sensor)")
     if arguments.picture:
         _picture(done, arguments)
     return {**describe_saved(done.map, out), **done.closure.summary()}

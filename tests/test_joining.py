@@ -59,6 +59,17 @@ def test_merged_is_one_run_over_both(settings, halves):
     assert equal(b, before[1])
 
 
+def test_frames_that_are_in_both_maps_count_once():
+    """Evidence that counts twice is too sure of itself."""
+    every = frames()
+    a, b = mapped(every[:9]), mapped(every[5:])
+    both, one = sv.merge(a, b), mapped(every)
+    assert equal(both, one)
+    assert both.frames == len(both.kept_frames) == sum(both.history.ways.values()) == len(every)
+    shifted = [replace(frame, T_world_sensor=frame.T_world_sensor + np.eye(4, k=3)) for frame in every[:3]]
+    assert equal(sv.merge(a, mapped(shifted)), a)
+
+
 def test_a_merged_map_goes_on_and_is_corrected_as_one_run(tmp_path):
     every = frames()
     sv.merge(mapped(every[:6]), mapped(every[6:12])).save(tmp_path / "m")

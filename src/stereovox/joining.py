@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -118,9 +118,10 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     """Merge two maps.
 
     Where both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
-    order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. Where they
-    cannot be merged so (`why_added` says why), their evidence adds up: see `products.merge`. Cells that had reached
-    their limits may then differ from those of one run.
+    order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame
+    that is in both, as where the parts of a recording overlap, counts once, from its pose in `a`. Where they cannot be
+    merged so (`why_added` says why), their evidence adds up: see `products.merge`. Cells that had reached their limits
+    may then differ from those of one run.
 
     Args:
         a: A map, whose settings the result has.
@@ -180,15 +181,25 @@ def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
 
 
 def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequence[KeptFrame]) -> VoxelMap:
-    """Return the map of the frames of both, at the poses given here."""
+    """Return the map of the frames of both, at the poses given here; what both have is taken once, from the first."""
+    known = set(map(_identity, ours))
+    twice = [frame for frame in theirs if _identity(frame) in known]
+    theirs = [frame for frame in theirs if _identity(frame) not in known]
     frames = [replace(frame, number=n) for n, frame in enumerate(_in_order(ours, theirs))]
     merged = VoxelMap(a.config)
     merged.history = together(a.history, b.history)
+    merged.history.frames = len(frames)
+    merged.history.ways -= Counter(frame.quality for frame in twice)
     merged.storage.kept = KeptFrames(a.config.map.frames_budget, frames)
     rebuild = Rebuild(merged.storage, Levels(a.config), {}, whole=True)
     rebuild.catch_up()
     rebuild.finish()
     return merged
+
+
+def _identity(frame: KeptFrame) -> tuple[str, int, str]:
+    """Return what two maps of one recording have in common of a frame, whatever its pose."""
+    return frame.sensor, frame.stamp_ns, frame.packed.digest
 
 
 def _in_order(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> list[KeptFrame]:

@@ -209,8 +209,8 @@ def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
     """Return all cells (N, 3) of a box round what the camera sees up to the maximum range, with room to spare."""
     far = 1.1 * config.max_range * _points_at_one(image.camera)[[0, 0, -1, -1], [0, -1, 0, -1]]
     corners = np.vstack([np.zeros(3), far]) @ image.T_world_sensor[:3, :3].T + image.T_world_sensor[:3, 3]
-    low = np.floor((corners.min(axis=0) - 1) / config.voxel_size).astype(int)
-    high = np.floor((corners.max(axis=0) + 1) / config.voxel_size).astype(int)
+    low = np.floor(corners.min(axis=0) / config.voxel_size).astype(int) - 2
+    high = np.floor(corners.max(axis=0) / config.voxel_size).astype(int) + 2
     return np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
 
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from examples import example_runner
 
 import stereovox
 from stereovox.cli import _parse
@@ -32,12 +33,18 @@ EXAMPLES = {line_of(page, found.start()): found[2] for page, found in BLOCKS if 
 EXAMPLES |= {f"examples/{path.name}": path.read_text() for path in FILES if "sys.argv" not in path.read_text()}
 
 
+@pytest.fixture(scope="module")
+def run_script():
+    with example_runner() as run:
+        yield run
+
+
 @pytest.mark.parametrize("where", EXAMPLES)
-def test_example_runs(where, tmp_path):
+def test_example_runs(where, tmp_path, run_script):
     script = tmp_path / "example.py"
     script.write_text(EXAMPLES[where])
-    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    status, told = run_script(script)
+    assert status == 0, told
 
 
 @pytest.mark.parametrize("where", SHOWN)

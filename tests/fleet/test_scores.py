@@ -58,6 +58,16 @@ def test_each_is_scored_as_one_by_one(sequences, made, tmp_path):
         assert one.scores["tp"] > 0
 
 
+def test_without_a_profile_cells_are_those_of_a_map_of_the_first_recording(sequences, scheduler, tmp_path):
+    said, given = [], {"options": ScoreOptions(frames=":1", threshold=0.35), "max_range": 40.0}
+    found = score_fleet(sequences[:1], tmp_path / "s", scheduler=scheduler, notify=said.append, **given)
+    mapped = sv.map_recording(sequences[0], tmp_path / "m.svox", poses="given", frames=":1", max_range=40.0).map
+    assert mapped.config.voxel_size == 0.2
+    assert any("cells of 0.2 m" in line for line in said)
+    truth, _ = lidar_truth(sv.open_source(sequences[0]), 0.2, 40.0, "view", ":1")
+    assert found.scored[0].scores == score(mapped, truth, 0.35).as_dict()
+
+
 def test_the_table_is_kept_and_adds_up(made):
     with open(f"{made.out}/scores.csv", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -28,7 +28,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder or s3:// URL for scores.csv and scores.json"
     )
-    about = "profile name or TOML file; repeatable, to compare them (default)"
+    about = (
+        "profile name or TOML file; repeatable, to compare them (default, cells and range as suggested)"
+    )
     parser.add_argument("--profile", action="append", metavar="P", help=about)
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
@@ -57,7 +59,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say_about_compiling()
     with progress_of_steps("recordings") as progress:
         scores = score_fleet(
-            arguments.recordings, arguments.out, arguments.profile or ["default"], options=options,
+            arguments.recordings, arguments.out, arguments.profile, options=options, notify=say,
             resume=arguments.resume, workers=arguments.workers, scheduler=arguments.scheduler, progress=progress,
             **overrides(arguments),
         )  # fmt: skip

@@ -176,14 +176,7 @@ def settings_for(
 
     Raises ConfigError for settings under which boxes cannot be mapped one by one.
     """
-    chosen, lines = dict[str, Any](), list[str]()
-    if profile is None:
-        for one in recordings:
-            try:
-                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
-                break
-            except StereovoxError:
-                continue  # the next one may do; what is wrong with this one is told later
+    chosen, lines = suggested(recordings, overrides) if profile is None else ({}, [])
     config = load_config("default" if profile is None else profile, **{**overrides, **chosen})
     flat = {"window.size": config.window.size, "max_memory": config.max_memory}
     flat |= {"deadline_ms": config.deadline_ms, "map.forget_s": config.map.forget_s}
@@ -193,6 +186,16 @@ def settings_for(
     if config.dimensions != 3 or config.device != "cpu" or config.map.frames_budget is not None:
         raise ConfigError("a fleet maps in space, on processors, and keeps all frames; choose a profile that does")
     return load_config(config, **{"map.keep_frames": False}), lines
+
+
+def suggested(recordings: Sequence[Recording], overrides: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return the settings that the first of the recordings suggests that can be opened, and lines about them."""
+    for one in recordings:
+        try:
+            return survey(open_source(one.where), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
+        except StereovoxError:
+            continue  # the next one may do; what is wrong with this one is told later
+    return {}, []
 
 
 def box_side(box_m: float | None, config: Config) -> int:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +20,7 @@ from stereovox.evaluate.metrics import Confusion
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.fleet.cluster import cluster
-from stereovox.fleet.fleet import Progress
+from stereovox.fleet.fleet import Progress, suggested
 from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of
 from stereovox.maps.boxed_manifest import only_writer_at
 from stereovox.maps.store import MANIFEST
@@ -118,13 +118,14 @@ class FleetScores:
 def score_fleet(
     recordings: Iterable[str | Path | Recording],
     out: str | Path,
-    profiles: Iterable[str | Path | Config] = ("default",),
+    profiles: Iterable[str | Path | Config] | None = None,
     *,
     options: ScoreOptions | None = None,
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress = lambda done, total, doing: None,
+    notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> FleetScores:
     """Map each of many recordings alone, and score its map against the truth that its lidar gives.
@@ -134,12 +135,14 @@ def score_fleet(
     Args:
         recordings: See `recordings_of`; each must have a lidar, as KITTI's have.
         out: Folder or URL for `scores.csv` (the table) and `scores.json` (all measures).
-        profiles: Profiles to compare: names, TOML files or `Config`.
+        profiles: Profiles to compare: names, TOML files or `Config`; None: the default one with the cell size and range
+            that the first recording suggests, as for `map_fleet`.
         options: How maps are compared with the truth; None: as Valenti 2018 does.
         resume: Go on with scores that are there.
         workers: Processes of a cluster of this machine; None: one for each core.
         scheduler: Address of a Dask scheduler (`tcp://host:8786`) in place of that.
         progress: Called with steps done, steps in all, and the current activity.
+        notify: Called with a line about settings that the recording suggests.
         **overrides: Settings by name, for all profiles.
 
     Returns:
@@ -153,6 +156,11 @@ def score_fleet(
     """
     options = _checked(options or ScoreOptions())
     listed, place = recordings_of(recordings), Place.of(out)
+    if profiles is None:
+        chosen, lines = suggested(listed, overrides)
+        for line in lines:
+            notify(f"note: {line}")
+        profiles, overrides = ["default"], {**overrides, **chosen}
     configs = [load_config(profile, **overrides) for profile in profiles]
     if not configs:
         raise StereovoxError("no profile is named; give one or more")

@@ -63,6 +63,11 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
         self.reason = reason
 
 
+def without_name(error: Exception, name: object) -> str:
+    """Return what an error says, for a line that names what it is about already."""
+    return str(error).removeprefix(f"{name}: ")
+
+
 def one_line(text: str) -> str:
     """Return `text` as one printable line: line ends and terminal colours are escaped, a long middle is cut."""
     if len(text) > MAX_LINE_LENGTH:

@@ -28,9 +28,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder or s3:// URL for scores.csv and scores.json"
     )
-    about = (
-        "profile name or TOML file; repeatable, to compare them (default, cells and range as suggested)"
-    )
+    about = "profile name or TOML file; repeatable, to compare them (default, cells and range as suggested)"
     parser.add_argument("--profile", action="append", metavar="P", help=about)
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.contents.description import Description, command_line, many, map_name, metres, picture_name, thousands
-from stereovox.errors import NoPoses, StereovoxError
+from stereovox.errors import NoPoses, StereovoxError, without_name
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
@@ -69,7 +69,7 @@ def _missing(path: str) -> tuple[str, list[str], list[str]]:
             commands.append(command_line("map", f"{path}{add}poses=FILE", "--out", name))
         return str(error), [], commands
     except StereovoxError as error:
-        return str(error), [f"cannot be mapped yet: {str(error).removeprefix(f'{path}: ')}"], []
+        return str(error), [f"cannot be mapped yet: {without_name(error, path)}"], []
     return "", [], []
 
 
@@ -243,7 +243,7 @@ def _bag_depth(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
     try:
         found = survey(open_source(path))
     except StereovoxError as error:
-        lines.append(f"no depth to map: {str(error).removeprefix(f'{path}: ')}")
+        lines.append(f"no depth to map: {without_name(error, path)}")
         return
     facts["depth"] = survey_facts(found)
     lines += _survey_lines(found)
@@ -259,7 +259,7 @@ def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
     try:
         found = _robot(path, open_robot(path))
     except StereovoxError as error:
-        lines.append(f"no scans to map: {str(error).removeprefix(f'{path}: ')}")
+        lines.append(f"no scans to map: {without_name(error, path)}")
         return
     facts["robot"] = found.facts
     lines += found.lines

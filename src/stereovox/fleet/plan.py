@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import Config, load_config
-from stereovox.errors import StereovoxError
+from stereovox.errors import StereovoxError, without_name
 from stereovox.fleet.fleet import box_side, settings_for
 from stereovox.fleet.recordings import Recording, boxes_with, recordings_of
 from stereovox.mapper import Mapper
@@ -84,7 +84,7 @@ def plan_fleet(
         try:
             length, rows, each_s, each_bytes = _looked_at(one, layout)
         except StereovoxError as error:
-            why = str(error).removeprefix(f"{one.where}: ")
+            why = without_name(error, one.where)
             unreadable.append(f"{one.where}: {why}")
             continue
         finally:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError, StereovoxError
+from stereovox.errors import MapFileError, StereovoxError, without_name
 from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
@@ -126,7 +126,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout) -> Re
         try:
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
         except StereovoxError as error:
-            return RecordingReport(recording.where, error=str(error).removeprefix(f"{recording.where}: "), notes=notes)
+            return RecordingReport(recording.where, error=without_name(error, recording.where), notes=notes)
         manifest = json_value((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
             home.write(name, (made / name).read_bytes())

@@ -14,7 +14,7 @@ from time import perf_counter
 from typing import Any
 
 from stereovox.config import Config, load_config
-from stereovox.errors import MapFileError, StereovoxError
+from stereovox.errors import MapFileError, StereovoxError, without_name
 from stereovox.evaluate.lidar_truth import FREE, lidar_truth
 from stereovox.evaluate.metrics import Confusion
 from stereovox.evaluate.scores import score
@@ -200,7 +200,7 @@ def score_recording(
                     truths[sizes] = TruthCells(truth, options.tolerance)
                 rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
             except StereovoxError as error:
-                why = str(error).removeprefix(f"{recording.where}: ")
+                why = without_name(error, recording.where)
                 rows.append(RecordingScore(recording.where, config.profile, error=why))
             rows[-1] = replace(rows[-1], seconds=perf_counter() - started)
     if not any(row.error for row in rows):  # what failed is tried again

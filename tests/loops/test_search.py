@@ -28,9 +28,9 @@ def test_scores_are_those_of_the_slow_twin():
     random = np.random.default_rng(0)
     grid = random.integers(-2, 3, (7, 5, 4)).astype(np.int8)
     cells = random.integers(-3, 9, (30, 3)).astype(np.int32)
-    found = np.empty((5, 3, 7), np.int32)
-    _search.scores(grid, cells, found)
-    np.testing.assert_array_equal(found, naive_scores(grid, cells, found.shape))
+    found = np.empty((5, 7, 3), np.int32)
+    _search.scores(np.ascontiguousarray(grid.transpose(0, 2, 1)), cells, found)
+    np.testing.assert_array_equal(found.transpose(0, 2, 1), naive_scores(grid, cells, (5, 3, 7)))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

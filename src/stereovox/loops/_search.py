@@ -6,18 +6,23 @@ from stereovox._jit import kernel
 
 @kernel
 def scores(grid, cells, found):
-    """Write to `found` (X, Y, Z) int32 the sum of `grid` over all cells, shifted by (x, y, z) less half the window.
+    """Write to `found` (X, Z, Y) int32 the sum of `grid` over all cells, shifted by (x, y, z) less half the window.
 
-    grid: (I, J, K) int8; beyond it is 0. cells: (N, 3) int32. The sizes of `found` are odd.
+    grid: (I, K, J) int8; beyond it is 0. cells: (N, 3) int32. The sizes of `found` are odd. The second axis is last in
+    both, since windows are flat: whole rows of the grid are added to rows of the window.
     """
-    half_x, half_y, half_z = found.shape[0] // 2, found.shape[1] // 2, found.shape[2] // 2
+    half_x, half_z, half_y = found.shape[0] // 2, found.shape[1] // 2, found.shape[2] // 2
     for x in range(found.shape[0]):
-        for y in range(found.shape[1]):
-            for z in range(found.shape[2]):
-                total = 0
-                for n in range(cells.shape[0]):
-                    i, j, k = cells[n, 0] + x - half_x, cells[n, 1] + y - half_y, cells[n, 2] + z - half_z
-                    inside = 0 <= i < grid.shape[0] and 0 <= j < grid.shape[1] and 0 <= k < grid.shape[2]
-                    if inside:
-                        total += grid[i, j, k]
-                found[x, y, z] = total
+        found[x] = 0
+        for n in range(cells.shape[0]):
+            i = cells[n, 0] + x - half_x
+            if not 0 <= i < grid.shape[0]:
+                continue
+            row = cells[n, 1] - half_y
+            first, last = max(0, -row), min(found.shape[2], grid.shape[2] - row)
+            for z in range(found.shape[1]):
+                k = cells[n, 2] + z - half_z
+                if 0 <= k < grid.shape[1]:
+                    sums, row_of_grid = found[x, z, first:last], grid[i, k, row + first : row + last]
+                    for y in range(last - first):
+                        sums[y] += row_of_grid[y]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from stereovox.loops.submaps import Shape
 from stereovox.se3 import Transform, inverse
 from stereovox.track.fit import Stage, deviations, motion_between, settled
-from stereovox.track.surfels import CONVERGED, Patches, SurfelMap
+from stereovox.track.surfels import CONVERGED, Level, Patches, SurfelMap
 from stereovox.track.views import View, contradiction
 
 FLOOR = np.diag(np.repeat([np.radians(0.3), 0.01], 3) ** 2)
@@ -77,9 +78,20 @@ def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
 def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | None:
     """Return the pose that lays patches onto surfels; None where too few have one, or lie where it is."""
     levels = surfels.levels(patches)[:LEVELS]
-    T, covariance = settled([Stage(level, CONVERGED * level.size) for level in levels], guess, DOUBT)
     middle = levels[1]
-    return None if middle.known < SHARED or middle.usual < USUAL else _Laid(T, covariance, middle.known)
+
+    def stages() -> Iterator[Stage]:
+        for level in levels:
+            yield Stage(level, CONVERGED * level.size)
+            if level is middle and not _is_one_place(middle):
+                return  # the finer ones, which take longest, would be for nothing
+
+    T, covariance = settled(stages(), guess, DOUBT)
+    return _Laid(T, covariance, middle.known) if _is_one_place(middle) else None
+
+
+def _is_one_place(level: Level) -> bool:
+    return level.known >= SHARED and level.usual >= USUAL
 
 
 def _looked_through(earlier: list[View], later: list[View], T: Transform) -> float:

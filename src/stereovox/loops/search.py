@@ -72,13 +72,15 @@ class Search:
         seeds = later.points[:: max(1, len(later.points) // SEEDS)]
         steps = int(np.ceil(turn / self._turn))
         window = 2 * np.ceil(reach / self._cell).astype(int) + 1
-        found, peaks = np.empty(window, np.int32), list[_Peak]()
+        rows, peaks = np.ascontiguousarray(self._grid.transpose(0, 2, 1)), list[_Peak]()
+        found = np.empty(window[[0, 2, 1]], np.int32)
         for angle in self._turn * np.arange(-steps, steps + 1):
             T = self._T @ guess
             T[:3, :3] = rotation_matrix([0, 0, angle]) @ T[:3, :3]
             cells = np.floor((seeds @ T[:3, :3].T + T[:3, 3]) / self._cell).astype(np.int64) - self._low
-            _search.scores(self._grid, cells.astype(np.int32), found)
-            for place, score in self._highest(found, LEAST * ON * len(seeds), most):
+            _search.scores(rows, cells.astype(np.int32), found)
+            by_axis = np.ascontiguousarray(found.transpose(0, 2, 1))
+            for place, score in self._highest(by_axis, LEAST * ON * len(seeds), most):
                 shift = self._cell * (np.array(place) - window // 2)
                 peaks.append(_Peak(score, angle, T[:3, 3] + shift, T[:3, :3]))
         return [inverse(self._T) @ peak.pose for peak in _apart(peaks)[:most]]
@@ -103,18 +105,21 @@ class Search:
 
     def _mark_free_in(self, slab: NDArray[np.int8], first: int, views: Iterable[View]) -> None:
         """Mark those of a part of the grid, from this number along its first axis."""
-        index = np.stack(np.meshgrid(*map(np.arange, slab.shape), indexing="ij"), axis=-1).reshape(-1, 3)
-        middles = (index + [first, 0, 0] + self._low + 0.5) * self._cell
+        starts = np.array([first, 0, 0]) + self._low + 0.5
+        x, y, z = (self._cell * (np.arange(n) + start) for n, start in zip(slab.shape, starts, strict=True))
         for view in views:
             T = inverse(self._T @ view.T)
-            points = middles @ T[:3, :3].T + T[:3, 3]
-            ahead = points[:, 2] > self._cell
-            place = (points[:, :2] / np.where(ahead, points[:, 2], 1.0)[:, None] / view.slope + 1) / 2 * GRID[::-1]
-            inside = ahead & np.all((place >= 0) & (place < GRID[::-1]), axis=1)
-            column, row = np.floor(place[inside]).astype(int).T
-            nearest = view.nearest[row, column]
-            free = np.isfinite(nearest) & (points[inside, 2] < nearest - BEHIND_M)
-            slab.reshape(-1)[np.flatnonzero(inside)[free]] = THROUGH
+            middles = [(x * a)[:, None, None] + (y * b)[:, None] + (z * c + d) for a, b, c, d in T[:3]]
+            ahead = np.flatnonzero(middles[2] > self._cell)
+            away = middles[2].reshape(-1)[ahead]
+            column, row = (
+                np.floor((middles[axis].reshape(-1)[ahead] / away / view.slope[axis] + 1) / 2 * GRID[1 - axis])
+                for axis in (0, 1)
+            )
+            inside = (column >= 0) & (column < GRID[1]) & (row >= 0) & (row < GRID[0])
+            nearest = view.nearest[row[inside].astype(np.intp), column[inside].astype(np.intp)]
+            free = np.isfinite(nearest) & (away[inside] < nearest - BEHIND_M)
+            slab.reshape(-1)[ahead[inside][free]] = THROUGH
 
     def _mark_surfaces(self, points: NDArray[np.float64]) -> None:
         """Mark cells with a surface, and those beside them."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +71,7 @@ def both(one: Equations, other: Equations) -> Equations:
 
 
 def settled(
-    stages: Sequence[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
+    stages: Iterable[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the pose (4, 4) that the stages lead to, and its covariance (6, 6) by the last one.
 
@@ -79,12 +79,13 @@ def settled(
     way. Where that stage contradicts the one before it, the pose is that of the one before, and open: its covariance is
     `doubt`.
 
-    doubt: (6, 6) covariance of the expectation. start: where to begin if not there.
+    stages: each is asked for once those before it have settled. doubt: (6, 6) covariance of the expectation. start:
+    where to begin if not there.
     """
     scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
     T, covariance = expected if start is None else start, doubt
-    before, agreed = T, doubt
-    for stage in stages:
+    before, agreed, number = T, doubt, 0
+    for number, stage in enumerate(stages, 1):
         before, agreed, widest = T, covariance, 0.0
         for _ in range(STEPS):
             information, gradient = stage.equations(T)
@@ -99,7 +100,7 @@ def settled(
             T = _moved(T, motion)
             if np.abs(motion).max() < stage.converged:
                 break
-    if len(stages) > 1 and contrary(before, T, agreed + covariance):
+    if number > 1 and contrary(before, T, agreed + covariance):
         return before, doubt
     return T, covariance
 

@@ -203,6 +203,9 @@ def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the information (6, 6) that patches with normals in all directions would hold; spread: (10,) moments."""
     weight, (x, y, z) = spread[0], spread[1:4]
     xx, xy, xz, yy, yz, zz = spread[4:]
-    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turning = np.array([[yy + zz, -xy, -xz], [-xy, xx + zz, -yz], [-xz, -yz, xx + yy]])
-    return np.block([[turning, across], [across.T, weight * np.eye(3)]])
+    held = np.zeros((6, 6))
+    held[:3, :3] = [[yy + zz, -xy, -xz], [-xy, xx + zz, -yz], [-xz, -yz, xx + yy]]
+    held[:3, 3:] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    held[3:, :3] = held[:3, 3:].T
+    held[3:, 3:] = weight * np.eye(3)
+    return held

@@ -122,8 +122,12 @@ def _seen_through(one: View, other: View, deviations: float) -> tuple[int, int]:
 
 def _places(view: View, points: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
     """Return row and column in a view's grid of points (N, 3) in its camera's frame, and which lie in it."""
-    ahead = points[:, 2] > 0.05
-    where = points[:, :2] / np.where(ahead, points[:, 2], 1.0)[:, None] / view.slope
-    place = np.floor((where + 1) / 2 * GRID[::-1]).astype(np.intp)
-    inside = ahead & np.all((place >= 0) & (place < GRID[::-1]), axis=1)
-    return place[:, 1], place[:, 0], inside
+    inside = points[:, 2] > 0.05
+    away = np.where(inside, points[:, 2], 1.0)
+    column, row = (
+        np.floor((points[:, axis] / away / view.slope[axis] + 1) / 2 * GRID[1 - axis]).astype(np.intp)
+        for axis in (0, 1)
+    )
+    for place, size in ((column, GRID[1]), (row, GRID[0])):
+        inside &= (place >= 0) & (place < size)
+    return row, column, inside

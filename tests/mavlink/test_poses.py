@@ -183,7 +183,7 @@ def test_poses_go_on_after_a_reset(quiet):
     assert [line.rpartition(": ")[2] for line in told] == ["poses go on from those before it"] * 2
 
 
-@pytest.mark.parametrize("before_ms", [[0], [0, 100]])
+@pytest.mark.parametrize("before_ms", [[400], [0, 100], [590, 600], [400, 400]])
 def test_poses_jump_after_a_reset_where_nobody_knows_what_was_before(quiet, before_ms):
     link, taken, told, _ = quiet
     for ms in before_ms:

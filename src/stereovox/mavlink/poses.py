@@ -31,8 +31,9 @@ OLDEST_NS, NEWEST_NS = 2_000_000_000, 50_000_000
 """How old a pose may be when it comes, and how far ahead of this machine's clock; else the clocks do not agree."""
 PREFERRED_NS = 1_000_000_000
 """While ODOMETRY, or ATTITUDE_QUATERNION, came within this time, LOCAL_POSITION_NED, or ATTITUDE, is passed over."""
-LONGEST_RESET_NS = 500_000_000
-"""Between the poses before and after a reset, for where the vehicle went meanwhile to be known."""
+LONGEST_RESET_NS, RESET_STEPS = 500_000_000, 5
+"""Between the poses before and after a reset, and as a multiple of the time between the two before it: longer, and
+nobody knows where the vehicle went meanwhile."""
 MAX_LENGTH_ERROR = 0.01
 """By which the length of a quaternion may differ from 1."""
 
@@ -179,18 +180,26 @@ class PoseReceiver:
         self._into.add(stamp_ns, T_world_body)
 
     def _go_on(self, stamp_ns: int, T_autopilot_body: Transform) -> None:
-        """Take the body for where it would have been without the reset, by its last two poses, and turned so."""
-        words = "the autopilot's position was reset"
-        (first_ns, first), (then_ns, then) = (self._recent[0], self._recent[-1]) if self._recent else ((0, None),) * 2
-        if first is None or then is None or stamp_ns - first_ns > LONGEST_RESET_NS or not then_ns > first_ns:
+        """Take the body for where it would be without the reset, and turned so about the vertical."""
+        words, expected = "the autopilot's position was reset", self._expected(stamp_ns)
+        if expected is None:
             self._tell(f"{words}: poses jump, and what is mapped stays where it is")
             return
-        expected = interpolate(first, then, (stamp_ns - first_ns) / (then_ns - first_ns))
         R = expected[:3, :3] @ T_autopilot_body[:3, :3].T
         T = lifted((0.0, 0.0, np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])))
         T[:3, 3] = expected[:3, 3] - T[:3, :3] @ T_autopilot_body[:3, 3]
         self._T_world_autopilot = T
         self._tell(f"{words}: poses go on from those before it")
+
+    def _expected(self, stamp_ns: int) -> Transform | None:
+        """Return where the body is if it went on as between its last two poses, None where that is long ago."""
+        if len(self._recent) < 2:
+            return None
+        (first_ns, first), (then_ns, then) = self._recent
+        step_ns, ahead_ns = then_ns - first_ns, stamp_ns - then_ns
+        if step_ns <= 0 or not 0 <= ahead_ns <= min(LONGEST_RESET_NS, RESET_STEPS * step_ns):
+            return None
+        return interpolate(first, then, 1 + ahead_ns / step_ns)
 
     def _pass_over(self, reason: str, line: str) -> None:
         self.passed_over[reason] = self.passed_over.get(reason, 0) + 1

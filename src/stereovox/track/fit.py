@@ -85,7 +85,8 @@ def settled(
     scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
     T, covariance = expected if start is None else start, doubt
     before, agreed, number = T, doubt, 0
-    for number, stage in enumerate(stages, 1):
+    for stage in stages:
+        number += 1
         before, agreed, widest = T, covariance, 0.0
         for _ in range(STEPS):
             information, gradient = stage.equations(T)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Positions that do not drift hold the way of a camera."""
 
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 import pytest
 from made_loops import ELSEWHERE, mapped, off, truths
@@ -25,10 +28,16 @@ def measured(sigma, every_ns=1_000_000_000, length=None):
     return Positions(stamps, places + random.normal(0, sigma, places.shape), sigma)
 
 
-def held(positions):
+@cache
+def unfinished():
     closer = LoopCloser(mapped(WALK, 0, 230).config)
     for frame in mapped(WALK, 0, 230).kept_frames.frames:  # the ring is not closed
         closer.add(frame)
+    return closer
+
+
+def held(positions):
+    closer = deepcopy(unfinished())
     closer.finish(positions=positions)
     return closer
 

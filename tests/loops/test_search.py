@@ -55,6 +55,25 @@ def test_a_submap_is_found_on_itself_from_a_wrong_guess(seed):
     assert not again or min(again) > 0.2  # no place is given twice
 
 
+def test_what_views_looked_through_is_that_of_each_cell():
+    closer = closed(RING, 0, 90)
+    shape, level = closer.shapes[closer.submaps[5]], rotation_matrix([0.3, 0.2, 0.1])
+    found = Search(shape.points, shape.views, level)
+    free = 0
+    for cell in np.argwhere(found._grid <= 0)[::7]:  # no surface there, or beside
+        middle, through = level.T @ ((cell + found._low + 0.5) * found._cell), False
+        for view in shape.views:
+            x, y, z = (inverse(view.T) @ [*middle, 1])[:3]
+            if z > found._cell and max(abs(x / z / view.slope[0]), abs(y / z / view.slope[1])) < 1:
+                rows, columns = view.nearest.shape
+                row, column = (y / z / view.slope[1] + 1) / 2 * rows, (x / z / view.slope[0] + 1) / 2 * columns
+                nearest = view.nearest[int(row), int(column)]
+                through |= bool(np.isfinite(nearest) and z < nearest - search.BEHIND_M)
+        assert (found._grid[tuple(cell)] == search.THROUGH) == through
+        free += through
+    assert free > 20
+
+
 def test_a_large_grid_needs_little_memory_and_its_parts_are_as_the_whole(monkeypatch):
     closer = closed(RING)
     shape = closer.shapes[closer.submaps[10]]

@@ -4,6 +4,7 @@
 import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from stereovox.maps.cell_format import State
 from stereovox.places import Place, is_url
 from stereovox.products.coarsen import coarsen
 
-BOX_M = 1.6
+BOX_M = 2.4
 STOPS = [(State.OCCUPIED,), (State.OCCUPIED, State.TENTATIVE), (State.UNKNOWN, State.OCCUPIED), (State.UNKNOWN,)]
 
 
@@ -31,18 +32,32 @@ def flight(**settings):
     return mapper.map
 
 
-def boxed(where, cache_bytes=60 * 20**3, **settings):
-    """Return the map in boxes, opened with a cache of a few boxes."""
-    sv.save_boxed(flight(**settings), where, 2 * BOX_M if is_url(where) else BOX_M)  # a server is slow
-    return sv.load_map(where, cache_bytes=cache_bytes)
+def put_at(where, **settings):
+    """Save the map in boxes."""
+    sv.save_boxed(flight(**settings), where, 3.2 if is_url(where) else BOX_M)  # a server is slow
+
+
+def few_boxes(where):
+    """Return the map there, opened with a cache of a few boxes."""
+    return sv.load_map(where, cache_bytes=60 * 20**3)
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """Return the folder of the map in boxes; it must not be changed."""
     folder = tmp_path_factory.mktemp("boxed") / "m.svox"
-    sv.save_boxed(flight(), folder, BOX_M)
+    put_at(folder)
     return folder
+
+
+@pytest.fixture(scope="module", params=["folder", "s3"])
+def kept(request, saved):
+    """Return where the map is in boxes, in a folder and in a bucket; it must not be changed."""
+    if request.param == "folder":
+        return str(saved)
+    url = f"{request.getfixturevalue('s3')}/{uuid4().hex}/city.svox"
+    put_at(url)
+    return url
 
 
 def somewhere(n, seed=0):
@@ -59,10 +74,10 @@ def assert_same(ours, theirs):
         np.testing.assert_array_equal(a, b)
 
 
-def test_all_questions_are_answered_as_in_memory(where):
-    whole, big = flight(), boxed(where)
+def test_all_questions_are_answered_as_in_memory(kept):
+    whole, big = flight(), few_boxes(kept)
     assert isinstance(big, BoxedMap)
-    assert len(big.manifest.boxes) > (8 if is_url(where) else 20)
+    assert len(big.manifest.boxes) > (8 if is_url(kept) else 20)
     points = somewhere(3000)
     assert_same([big.state(points), big.probability(points), big.log_odds(points)],
                 [whole.state(points), whole.probability(points), whole.log_odds(points)])  # fmt: skip
@@ -79,7 +94,7 @@ def test_all_questions_are_answered_as_in_memory(where):
 
 @pytest.mark.parametrize("stop_at", STOPS, ids=str)
 def test_rays_stop_as_in_memory(saved, stop_at):
-    whole, big = flight(), sv.load_map(saved, cache_bytes=60 * 20**3)
+    whole, big = flight(), few_boxes(saved)
     ways = np.random.default_rng(2).normal(size=(400, 3))
     ways[:6] = [*np.eye(3), *-np.eye(3)]
     for origins, longest in ((somewhere(400), 30.0), (somewhere(400, 3), 2.5), ([2.0, 2.0, 1.0], np.inf)):
@@ -129,7 +144,8 @@ def test_what_needs_more_than_the_cache_is_refused_with_the_cure(saved):
 
 @pytest.mark.parametrize("settings", [{"map.keep_times": True}, {"map.cell": "int8"}], ids=str)
 def test_times_and_other_cells(tmp_path, settings):
-    whole, big = flight(**settings), boxed(tmp_path / "m.svox", **settings)
+    put_at(tmp_path / "m.svox", **settings)
+    whole, big = flight(**settings), few_boxes(tmp_path / "m.svox")
     assert_same(big.storage.blocks(), whole.storage.blocks())
     if whole.config.map.keep_times:
         coords = whole.storage.blocks()[0]
@@ -137,11 +153,11 @@ def test_times_and_other_cells(tmp_path, settings):
         assert_same([big.storage.times_of(coords)[known]], [whole.storage.times_of(coords)[known]])
 
 
-def test_levels_are_the_map_in_larger_cells(where):
-    big = boxed(where)
+def test_levels_are_the_map_in_larger_cells(kept):
+    big = few_boxes(kept)
     once = VoxelCells(coarsen(flight(), 2))
     layout = big.manifest.layout_of(1)
-    found = [read_box(Place.of(where), layout, entry) for entry in big.manifest.levels[0]]
+    found = [read_box(Place.of(kept), layout, entry) for entry in big.manifest.levels[0]]
     assert sum(map(len, (one.coords for one in found))) == len(once.blocks)
     for one in found:
         for coords, cells in zip(one.coords.tolist(), one.cells, strict=True):
@@ -162,7 +178,7 @@ class VoxelCells:
 
 
 def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
-    boxed(where)
+    put_at(where)
     before = sv.load_map(where).storage.blocks()
 
     def stop(*_):
@@ -188,7 +204,7 @@ def test_there_is_one_writer(where):
 
 
 def test_damage_is_told_by_the_box(where):
-    boxed(where)
+    put_at(where)
     place = Place.of(where)
     entry = read_boxed_manifest(place).boxes[5]
     name = f"{entry.name}/cells/c/0/0"

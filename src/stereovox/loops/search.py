@@ -83,7 +83,7 @@ class Search:
             for place, score in self._highest(by_axis, LEAST * ON * len(seeds), most):
                 shift = self._cell * (np.array(place) - window // 2)
                 peaks.append(_Peak(score, angle, T[:3, 3] + shift, T[:3, :3]))
-        return [inverse(self._T) @ peak.pose for peak in _apart(peaks)[:most]]
+        return [inverse(self._T) @ peak.pose for peak in _apart(peaks, most)]
 
     def _highest(self, found: NDArray[np.int32], least: float, most: int) -> list[tuple[tuple[int, ...], int]]:
         """Return where the highest scores are, and these, none in the neighbourhood of another; `found` is used up."""
@@ -146,12 +146,14 @@ class _Peak:
         return T
 
 
-def _apart(peaks: Sequence[_Peak]) -> list[_Peak]:
-    """Return peaks from high to low, without those near a higher one."""
+def _apart(peaks: Sequence[_Peak], most: int) -> list[_Peak]:
+    """Return at most so many peaks from high to low, without those near a higher one."""
     kept = list[_Peak]()
     for peak in sorted(peaks, key=lambda peak: -peak.score):
         if not any(_is_same(peak, other) for other in kept):
             kept.append(peak)
+        if len(kept) == most:
+            break
     return kept
 
 

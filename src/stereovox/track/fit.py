@@ -86,8 +86,7 @@ def settled(
     T, covariance = expected if start is None else start, doubt
     before, agreed, number = T, doubt, 0
     for stage in stages:
-        number += 1
-        before, agreed, widest = T, covariance, 0.0
+        before, agreed, number, widest = T, covariance, number + 1, 0.0
         for _ in range(STEPS):
             information, gradient = stage.equations(T)
             held, directions = _held(information, scale)

@@ -19,7 +19,7 @@ from stereovox.maps.cell_format import State
 from stereovox.places import Place, is_url
 from stereovox.products.coarsen import coarsen
 
-BOX_M = 2.4
+BOX_M = 1.6
 STOPS = [(State.OCCUPIED,), (State.OCCUPIED, State.TENTATIVE), (State.UNKNOWN, State.OCCUPIED), (State.UNKNOWN,)]
 
 
@@ -27,14 +27,14 @@ STOPS = [(State.OCCUPIED,), (State.OCCUPIED, State.TENTATIVE), (State.UNKNOWN, S
 def flight(**settings):
     """Return a map in memory; it must not be changed."""
     mapper = sv.Mapper(**{"voxel_size": 0.1, **settings})
-    for frame in sv.open_source("sim:apartment?image_width=80", frames="::24"):
+    for frame in sv.open_source("sim:apartment?image_width=80", frames="::36"):
         mapper.add(frame)
     return mapper.map
 
 
-def put_at(where, **settings):
+def put_at(where, box_m=2 * BOX_M, **settings):
     """Save the map in boxes."""
-    sv.save_boxed(flight(**settings), where, 3.2 if is_url(where) else BOX_M)  # a server is slow
+    sv.save_boxed(flight(**settings), where, box_m)
 
 
 def few_boxes(where):
@@ -46,7 +46,7 @@ def few_boxes(where):
 def saved(tmp_path_factory):
     """Return the folder of the map in boxes; it must not be changed."""
     folder = tmp_path_factory.mktemp("boxed") / "m.svox"
-    put_at(folder)
+    put_at(folder, BOX_M)
     return folder
 
 

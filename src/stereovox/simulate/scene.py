@@ -44,8 +44,13 @@ class Solid:
 
     def contains(self, points: ArrayLike, margin: float = 1e-6) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie in the solid; points up to `margin` metres outside count as in it."""
-        planes = self.planes
-        return np.all(planes[:, :3] @ np.asarray(points, float).T <= planes[:, 3:] + margin, axis=0)
+        points = np.asarray(points, float)
+        left = np.arange(len(points))
+        for *normal, offset in self.planes:  # most points are soon told to be outside
+            left = left[points[left] @ normal <= offset + margin]
+        inside = np.zeros(len(points), bool)
+        inside[left] = True
+        return inside
 
 
 class Scene:

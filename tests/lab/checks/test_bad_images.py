@@ -91,7 +91,7 @@ class Changing(PasserBy):
     """A wall with a cupboard before it, from frame to frame there or not."""
 
     def __init__(self):
-        super().__init__("near", image_width=424)
+        super().__init__("near", image_width=318)
 
     def at(self, i, cupboard):
         solids = self._surroundings + ([box("cupboard", "cupboard", (2.2, -3, 0), (2.6, 3, 3))] if cupboard else [])

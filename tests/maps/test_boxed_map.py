@@ -167,6 +167,23 @@ def test_levels_are_the_map_in_larger_cells(kept):
     assert small.config.cell[0] > big.config.cell[0]
 
 
+def test_boxes_of_an_odd_number_of_blocks_have_levels_as_well(tmp_path, monkeypatch):
+    """A block of the next level then lies in two boxes."""
+    monkeypatch.setattr("stereovox.maps.pyramid.SMALL", 100)
+    sv.save_boxed(flight(), tmp_path / "m.svox", 2.4)
+    big, coarse = sv.load_map(tmp_path / "m.svox"), flight()
+    assert big.manifest.layout.side == 24
+    assert len(big.manifest.levels) > 2
+    for level, entries in enumerate(big.manifest.levels, 1):
+        coarse = coarsen(coarse, 2)
+        expected, layout = VoxelCells(coarse), big.manifest.layout_of(level)
+        found = [read_box(Place.of(tmp_path / "m.svox"), layout, entry) for entry in entries]
+        assert sum(len(one.coords) for one in found) == len(expected.blocks)
+        for one in found:
+            for coords, cells in zip(one.coords.tolist(), one.cells, strict=True):
+                np.testing.assert_array_equal(layout.rules.states(cells), expected.states(tuple(coords)))
+
+
 class VoxelCells:
     def __init__(self, voxel_map):
         self._rules = voxel_map.storage.rules

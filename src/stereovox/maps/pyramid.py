@@ -58,10 +58,18 @@ def write_parent(place: Place, layout: BoxLayout, children: Sequence[BoxEntry]) 
     layout: of the children. None where no coarse cell is known. Raises MapFileError as `read_box` and `write_box` do.
     """
     parts = [halved(layout.rules, *read_box(place, layout, child)[:2]) for child in children]
-    coords, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.lexsort(coords.T[::-1])
-    blocks = BoxBlocks(coords[order], cells[order])
+    blocks = _joined(parts, layout.rules.format.unknown)
     return write_blocks(place, coarser_layout(layout), parent_of(children[0].box), blocks)
+
+
+def _joined(parts: Sequence[tuple[NDArray[np.int32], NDArray[np.integer]]], unknown: int) -> BoxBlocks:
+    """Return the blocks of all parts in order; boxes of an odd number of blocks have some in common, but no cell."""
+    coords, of_block = np.unique(np.concatenate([coords for coords, _ in parts]), axis=0, return_inverse=True)
+    cells = np.full((len(coords), CELLS), unknown, parts[0][1].dtype)
+    ends = np.cumsum([len(own) for own, _ in parts])
+    for (_, theirs), ours in zip(parts, np.split(of_block.ravel(), ends[:-1]), strict=True):
+        cells[ours] = np.where(theirs == unknown, cells[ours], theirs)
+    return BoxBlocks(coords, cells)
 
 
 def write_levels(place: Place, layout: BoxLayout, entries: Sequence[BoxEntry]) -> list[list[BoxEntry]]:

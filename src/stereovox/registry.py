@@ -3,12 +3,31 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping
-from importlib import import_module
-from importlib.metadata import entry_points
+from functools import lru_cache
+from importlib import import_module, metadata
 from typing import Any
 
 from stereovox.errors import ConfigError, did_you_mean
+
+
+def entry_points(group: str) -> metadata.EntryPoints:
+    """Return the entry points of a group; all packages are read once, and again when one is installed."""
+    return _entry_points(tuple((folder, _changed_ns(folder)) for folder in sys.path)).select(group=group)
+
+
+@lru_cache(maxsize=1)
+def _entry_points(folders: tuple[tuple[str, int], ...]) -> metadata.EntryPoints:
+    return metadata.entry_points()
+
+
+def _changed_ns(folder: str) -> int:
+    try:
+        return os.stat(folder or ".").st_mtime_ns
+    except (OSError, ValueError):
+        return 0
 
 
 def find(room: str, builtin: Mapping[str, str], name: str) -> Any:

@@ -146,7 +146,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     parser = _Parser(prog="stereovox", description=stereovox.__doc__)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for name in COMMANDS:
+    for name in words[:1] if words and words[0] in COMMANDS else COMMANDS:  # the others' modules take long to import
         module = _module(name)
         about = str(module.__doc__).strip()
         command = commands.add_parser(

@@ -44,6 +44,7 @@ job = json.loads(sys.argv[1])
 exec(job["program"])
 lines = ["import importlib, pickle"]
 for name in job["kernels"]:
+    assert machine_code.find(name).signatures, f"{name} was not called from Python"
     for signature in machine_code.find(name).signatures:
         types = f"pickle.loads({pickle.dumps(signature)!r})"
         lines.append("getattr(importlib.import_module({!r}), {!r}).compile({})".format(*name.split(":"), types))
@@ -73,7 +74,10 @@ def listings(program: str, kernels: list[str], processors: Iterable[Processor]) 
 
 
 def alone(program: str, kernels: list[str]) -> str:
-    """Run Python code in another process; return code that compiles the kernels that it called, for such arguments."""
+    """Run Python code in another process; return code that compiles the kernels that it called, for such arguments.
+
+    It must call them itself: of what other kernels call nothing is known where these come from the disk cache.
+    """
     return _answer(CALLS, {"program": program, "kernels": kernels})
 
 

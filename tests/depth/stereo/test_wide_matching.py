@@ -7,7 +7,7 @@ A loop that numba's promotions or checks keep from that still gives the right nu
 import re
 
 import pytest
-from machine_code import NEOVERSE_N1, ZEN_3, alone, listings
+from machine_code import NEOVERSE_N1, ZEN_3, listings
 
 MODULE = "stereovox.depth.stereo._semiglobal"
 ONE_PAIR = """
@@ -36,8 +36,7 @@ BLOCK = 64
 
 @pytest.fixture(scope="module")
 def made():
-    kernels = [f"{MODULE}:{name}" for name in WANTED]
-    return dict(zip(REGISTERS, listings(alone(ONE_PAIR, kernels), kernels, REGISTERS), strict=True))
+    return dict(zip(REGISTERS, listings(ONE_PAIR, [f"{MODULE}:{name}" for name in WANTED], REGISTERS), strict=True))
 
 
 @pytest.mark.parametrize("kernel", WANTED)

@@ -6,7 +6,7 @@ import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,25 +36,12 @@ def scheduler():
         yield cluster.scheduler_address
 
 
-@pytest.fixture(scope="module")
-def mapped(scheduler):
-    """Return `map_fleet` on that cluster, with boxes of 6.4 m."""
-    return partial(map_fleet, **SETTINGS, box_m=6.4, scheduler=scheduler)
-
-
-@pytest.fixture(scope="module")
-def first(mapped, tmp_path_factory):
-    """Return the map of one recording, which no test changes."""
-    return mapped([recording(1)], tmp_path_factory.mktemp("first") / "m.svox")
-
-
 @pytest.fixture
-def begun(first, tmp_path):
-    """Return the folder of a copy of that map."""
-    return shutil.copytree(first.out, tmp_path / "m.svox")
+def mapped(scheduler):
+    """Return `map_fleet` on that cluster, with boxes of 3.2 m."""
+    return partial(map_fleet, **SETTINGS, box_m=3.2, scheduler=scheduler)
 
 
-@cache
 def of_all(*recordings, **settings):
     """Return the blocks of one map of the frames that each recording's own mapper trusts, one after the other."""
     config = sv.load_config("default", voxel_size=0.2, **settings)
@@ -91,7 +78,7 @@ def test_clouds_and_depth_images_of_several_machines_make_one_map(mapped, tmp_pa
     assert_same(mapped(both, tmp_path / "m.svox").map.storage.blocks(), of_all(*both))
 
 
-@pytest.mark.parametrize("box_m", [4.8, 6.4, 12.8])
+@pytest.mark.parametrize("box_m", [3.2, 4.8, 12.8])
 def test_the_map_does_not_depend_on_the_boxes(mapped, tmp_path, box_m):
     made = mapped([recording(1), recording(2)], tmp_path / "m.svox", box_m=box_m)
     assert_same(made.map.storage.blocks(), of_all(recording(1), recording(2)))
@@ -110,25 +97,28 @@ def test_other_cells_and_times(mapped, tmp_path, settings):
         assert_same([one.times_of(coords)[known]], [alone(recording(1), **settings).storage.times_of(coords)[known]])
 
 
-def test_recordings_are_added_and_taken_away(mapped, first, begun):
-    both = mapped([recording(1), recording(2)], begun, resume=True)
+def test_recordings_are_added_and_taken_away(mapped, tmp_path):
+    where = tmp_path / "m.svox"
+    first = mapped([recording(1)], where)
+    both = mapped([recording(1), recording(2)], where, resume=True)
     assert_same(both.map.storage.blocks(), of_all(recording(1), recording(2)))
-    again = mapped([recording(1), recording(2)], begun, resume=True)
+    again = mapped([recording(1), recording(2)], where, resume=True)
     assert again.boxes == (both.boxes[0], 0)
-    less = mapped([recording(1)], begun, resume=True)
+    less = mapped([recording(1)], where, resume=True)
     assert_same(less.map.storage.blocks(), first.map.storage.blocks())
-    names = Place.of(begun).names("recordings/")
+    names = Place.of(where).names("recordings/")
     assert len({name.split("/")[1] for name in names}) == 1
 
 
-def test_far_away_recordings_leave_other_boxes_alone(mapped, first, begun, tmp_path):
+def test_far_away_recordings_leave_other_boxes_alone(mapped, tmp_path):
     """A second recording 100 m away: none of the boxes of the first one is mapped again."""
     frames = list(sv.open_source(recording(2)))
     far = np.array([frame.T_world_sensor for frame in frames])
     far[:, 0, 3] += 100
     write_trajectory(tmp_path / "far.tum", [frame.stamp_ns for frame in frames], far, "camera")
     there = Recording(recording(2), str(tmp_path / "far.tum"))
-    both = mapped([recording(1), there], begun, resume=True)
+    first = mapped([recording(1)], tmp_path / "m.svox")
+    both = mapped([recording(1), there], tmp_path / "m.svox", resume=True)
     assert both.boxes[1] == both.boxes[0] - first.boxes[0] > 0
 
 
@@ -182,16 +172,16 @@ def test_a_broken_recording_is_told_and_left_out(mapped, tmp_path):
         mapped(["sim:nowhere"], tmp_path / "n.svox")
 
 
-def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, begun, tmp_path):
+def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, tmp_path):
     shutil.copytree(recording(2), tmp_path / "drive")
-    made = mapped([recording(1), tmp_path / "drive"], begun, resume=True)
+    made = mapped([recording(1), tmp_path / "drive"], tmp_path / "m.svox")
     before = made.map.storage.blocks()
     shutil.rmtree(tmp_path / "drive")
     with pytest.raises(StereovoxError, match="is in the map and cannot be used now"):
-        mapped([recording(1), tmp_path / "drive"], begun, resume=True)
-    assert_same(sv.load_map(begun).storage.blocks(), before)
-    mapped([recording(1)], begun, resume=True)
-    assert_same(sv.load_map(begun).storage.blocks(), alone(recording(1)).storage.blocks())
+        mapped([recording(1), tmp_path / "drive"], tmp_path / "m.svox", resume=True)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), before)
+    mapped([recording(1)], tmp_path / "m.svox", resume=True)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
 
 
 def test_two_fleets_of_one_cluster_write_their_own_maps(mapped, tmp_path):
@@ -211,15 +201,16 @@ def test_two_fleets_do_not_write_one_map(mapped, where):
         other.submit(mapped, [recording(1)], where).result()
 
 
-def test_recordings_of_an_object_store(mapped, first, s3, tmp_path):
+def test_recordings_of_an_object_store(mapped, s3, tmp_path):
     folder = Path(recording(1))
+    local = mapped([folder], tmp_path / "m.svox")
     place = Place.of(f"{s3}/recordings-{os.getpid()}")
     for file in sorted(folder.rglob("*")):
         if file.is_file():
             place.write(f"{folder.name}/{file.relative_to(folder)}", file.read_bytes())
     stored = mapped([f"{place}/{folder.name}"], tmp_path / "n.svox")
-    assert_same(stored.map.storage.blocks(), first.map.storage.blocks())
-    assert stored.map.frames == 8
+    assert_same(stored.map.storage.blocks(), local.map.storage.blocks())
+    assert stored.map.frames == 12
 
 
 def test_killed_workers_change_nothing(tmp_path):
@@ -258,15 +249,16 @@ def test_settings_that_boxes_cannot_have_are_named(tmp_path, settings, named):
         map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, **settings)
 
 
-def test_a_map_is_gone_on_with_as_it_was_made(mapped, first, begun, scheduler):
-    again = map_fleet([recording(1)], begun, resume=True, scheduler=scheduler)
-    assert again.boxes == (first.boxes[0], 0)
-    for other in ({"voxel_size": 0.1}, {"box_m": 3.2}):
+def test_a_map_is_gone_on_with_as_it_was_made(mapped, scheduler, tmp_path):
+    made = mapped([recording(1)], tmp_path / "m.svox")
+    again = map_fleet([recording(1)], tmp_path / "m.svox", resume=True, scheduler=scheduler)
+    assert again.boxes == (made.boxes[0], 0)
+    for other in ({"voxel_size": 0.1}, {"box_m": 6.4}):
         with pytest.raises(MapFileError, match="made with other settings"):
-            mapped([recording(1)], begun, resume=True, **other)
-    (begun / "fleet.json").write_text("{}")
+            mapped([recording(1)], tmp_path / "m.svox", resume=True, **other)
+    (tmp_path / "m.svox/fleet.json").write_text("{}")
     with pytest.raises(MapFileError, match=r"fleet\.json: is damaged"):
-        mapped([recording(1)], begun, resume=True)
+        mapped([recording(1)], tmp_path / "m.svox", resume=True)
 
 
 def test_names_of_recordings(tmp_path):

@@ -256,10 +256,26 @@ class Bucket(Place):
 
     def sizes(self, prefix: str = "") -> dict[str, int]:
         """Return names and bytes of the objects; a store lists whole parts of names, the rest is chosen here."""
+        return {item["path"]: item["size"] for item in self._listed(prefix)}
+
+    def versions(self, prefix: str = "") -> dict[str, list[Any]]:
+        """Return the names of files as `sizes` does, with bytes and tag, of which one changes with what a file holds.
+
+        Empty objects that stand for folders, as consoles of stores make them, are left out.
+        """
+        found = self._listed(prefix)
+        folders = {above for item in found for above in _folders_above(item["path"])}
+        return {
+            item["path"]: [item["size"], item["e_tag"] or str(item["last_modified"])]
+            for item in found
+            if item["path"] not in folders
+        }
+
+    def _listed(self, prefix: str) -> list[Any]:
         within = prefix.rpartition("/")[0] or None
         with self._one_line(prefix):
-            found = {item["path"]: item["size"] for part in self._store.list(within) for item in part}
-        return {name: found[name] for name in sorted(found) if name.startswith(prefix)}
+            found = [item for part in self._store.list(within) for item in part if item["path"].startswith(prefix)]
+        return sorted(found, key=lambda item: item["path"])
 
     def remove(self, names: Iterable[str]) -> None:
         """Delete objects, many with one request."""
@@ -299,6 +315,13 @@ class Bucket(Place):
             raise MapFileError(
                 f"{self}/{name}: the store cannot be used ({reason}); check AWS_ENDPOINT_URL, keys and the network"
             ) from None
+
+
+def _folders_above(name: str) -> Iterator[str]:
+    """Yield the names of the folders that lead to a file."""
+    while name:
+        name = name.rpartition("/")[0]
+        yield name
 
 
 def _checked(place: Place, name: str) -> str:

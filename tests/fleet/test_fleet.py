@@ -4,10 +4,12 @@
 import os
 import shutil
 import signal
+import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from made_clouds import room_cloud
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings_of
-from stereovox.fleet.recordings import boxes_with
+from stereovox.fleet.recordings import boxes_with, fingerprint, local
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
 from stereovox.places import Place
@@ -297,6 +299,49 @@ def test_keys_know_what_frames_depend_on(tmp_path):
     others = {one.key(layout(voxel_size=0.2)), one.key(layout(128)), replace(one, poses="x.tum").key(layout())}
     (tmp_path / "a.txt").write_text("12")
     assert len({before, one.key(layout())} | others) == 5
+
+
+def test_keys_know_files_behind_links(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "disk/a.txt").write_text("1")
+    (tmp_path / "drive/depth").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk/back").symlink_to(tmp_path / "drive")
+    before = fingerprint(str(tmp_path / "drive"))
+    assert [name for name, *_ in before] == ["depth/a.txt"]
+    (tmp_path / "disk/a.txt").write_text("12")
+    assert fingerprint(str(tmp_path / "drive")) != before
+
+
+def test_keys_know_what_objects_hold_and_only_their_own(s3):
+    above = f"{s3}/{uuid4().hex}"
+    place, drive = Place.of(above), f"{above}/drive1"
+    place.write("drive1/a.txt", b"1")
+    before = fingerprint(drive)
+    place.write("drive10/b.txt", b"")
+    assert fingerprint(drive) == before
+    place.write("drive1/a.txt", b"2")
+    assert fingerprint(drive) != before
+    place.write("one.bag", b"1")
+    assert [name for name, _ in fingerprint(f"{above}/one.bag")] == ["one.bag"]
+
+
+def test_a_recording_in_a_store_may_have_objects_that_stand_for_folders(s3, tmp_path):
+    above = f"{s3}/{uuid4().hex}"
+    Place.of(above).write("drive/depth/a.png", b"1")
+    for folder in ("drive/", "drive/depth/"):
+        url = f"{os.environ['AWS_ENDPOINT_URL']}/{above.removeprefix('s3://')}/{folder}"
+        urllib.request.urlopen(urllib.request.Request(url, method="PUT"))
+    copy = Path(local(f"{above}/drive", tmp_path))
+    assert [file.read_bytes() for file in copy.rglob("*") if file.is_file()] == [b"1"]
+
+
+def test_a_recording_that_changes_meanwhile_is_mapped_all_the_same(mapped, tmp_path):
+    shutil.copytree(recording(1), tmp_path / "drive")
+    made = mapped(
+        [tmp_path / "drive"], tmp_path / "m.svox", progress=lambda *_: (tmp_path / "drive" / "notes.txt").write_text("")
+    )
+    assert_same(made.map.storage.blocks(), alone(recording(1)).storage.blocks())
 
 
 def test_boxes_are_those_with_evidence():

@@ -144,8 +144,9 @@ def map_fleet(
     check_boxed_target(place, (SETTINGS, f"{RECORDINGS}/", f"{DONE}/"))
     with only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
+        keys = {one: one.key(layout) for one in listed}  # once: files may change meanwhile
         with cluster(scheduler, workers) as run:
-            reports = _indexed(run, place, listed, layout, progress)
+            reports = _indexed(run, place, keys, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
                 first = reports[listed[0]]
@@ -153,14 +154,14 @@ def map_fleet(
                     f"not one recording could be used, no map is written ({first.recording}: {first.error})"
                 )
             _check_still_there(place, reports)
-            boxes, before = _boxes(place, layout, [(one, reports[one].frames) for one in used]), _done(place)
+            boxes, before = _boxes(place, layout, [(keys[one], reports[one].frames) for one in used]), _done(place)
             done = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
             levels = _levels(run, place, layout, entries, progress)
         inputs = {inputs: None if box.entry is None else box.entry.box for inputs, box in done.items()}
-        manifest = _manifest(place, layout, used, entries, levels, inputs)
+        manifest = _manifest(place, layout, {one: keys[one] for one in used}, entries, levels, inputs)
         write_boxed_manifest(place, manifest)
-        _sweep(place, manifest, {one.key(layout) for one in used})
+        _sweep(place, manifest, {keys[one] for one in used})
     made = [box for inputs, box in done.items() if inputs not in before]
     return FleetMap(
         BoxedMap(place, manifest), str(out), [reports[one] for one in listed], (len(boxes), len(made)),
@@ -251,26 +252,26 @@ def _known_layout(place: Place) -> BoxLayout | None:
 
 
 def _indexed(
-    run: Cluster, place: Place, listed: Sequence[Recording], layout: BoxLayout, progress: Progress
+    run: Cluster, place: Place, keys: Mapping[Recording, str], layout: BoxLayout, progress: Progress
 ) -> dict[Recording, RecordingReport]:
     """Return what each recording gave; those that were not mapped alone before are."""
-    keys = {one.key(layout): one for one in listed}
-    reports = {one: report for key, one in keys.items() if (report := report_of(place, key)) is not None}
-    tasks = {key: (place, one, layout) for key, one in keys.items() if one not in reports}
-    progress(len(reports), len(listed), "recordings")
-    for key, report in run.results(index_recording, tasks):
-        reports[keys[key]] = report
-        progress(len(reports), len(listed), "recordings")
+    reports = {one: report for one, key in keys.items() if (report := report_of(place, key)) is not None}
+    missing = {one.where: one for one in keys if one not in reports}
+    tasks = {where: (place, one, layout, keys[one]) for where, one in missing.items()}
+    progress(len(reports), len(keys), "recordings")
+    for where, report in run.results(index_recording, tasks):
+        reports[missing[where]] = report
+        progress(len(reports), len(keys), "recordings")
     return reports
 
 
-def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[Recording, int]]) -> list[Box]:
-    """Return the boxes that the frames of recordings see; these come with their numbers of frames."""
-    keys, start_ns = [(one.key(layout), frames) for one, frames in used], None
+def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[str, int]]) -> list[Box]:
+    """Return the boxes that the frames of recordings see; given are the key of each and its number of frames."""
+    start_ns = None
     if layout.config.map.keep_times:
-        with frames_of(place, keys[0][0], [0]) as frames:
+        with frames_of(place, used[0][0], [0]) as frames:
             start_ns = next(frames).seen.stamp_ns
-    return boxes_of([(key, boxes_seen(place, key), frames) for key, frames in keys], start_ns)
+    return boxes_of([(key, boxes_seen(place, key), frames) for key, frames in used], start_ns)
 
 
 def _check_still_there(place: Place, reports: Mapping[Recording, RecordingReport]) -> None:
@@ -341,12 +342,12 @@ def _levels(
 def _manifest(
     place: Place,
     layout: BoxLayout,
-    used: Sequence[Recording],
+    used: Mapping[Recording, str],
     entries: list[BoxEntry],
     levels: list[list[BoxEntry]],
     inputs: dict[str, Any],
 ) -> BoxedManifest:
-    manifests = [manifest_of(place, one.key(layout)) for one in used]
+    manifests = [manifest_of(place, key) for key in used.values()]
     histories = [History.loaded(one) for one in manifests]
     starts = [entry.times_start_ns for entry in entries if entry.times_start_ns is not None]
     return BoxedManifest(

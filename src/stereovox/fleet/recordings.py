@@ -14,7 +14,7 @@ import json
 import os
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +32,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.maps.store import MANIFEST, MAX_MANIFEST
-from stereovox.places import Folder, Place, is_url
+from stereovox.places import Bucket, Folder, Place, is_url
 from stereovox.pose_choice import GIVEN
 from stereovox.remapping import remap
 from stereovox.run import MapRun
@@ -60,7 +60,7 @@ class Recording:
     poses: str | None = None
 
     def key(self, layout: BoxLayout) -> str:
-        """Return a name made of all that is kept: the files, the poses, the settings and the boxes."""
+        """Return a name made of all that is kept: the files as they are now, the poses, the settings and the boxes."""
         settings = [layout.side, layout.config.model_dump(mode="json", exclude={"threads"})]
         files = [fingerprint(self.where), None if self.poses is None else fingerprint(self.poses)]
         return digest([VERSION, self.where, files, settings])
@@ -115,13 +115,14 @@ def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
     return found
 
 
-def index_recording(place: Place, recording: Recording, layout: BoxLayout) -> RecordingReport:
+def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: str) -> RecordingReport:
     """Map a recording alone, and put what is kept of it into a place, the report last; a task of a worker.
 
+    key: as `Recording.key` was when the run began; on another machine, or of files that change, it may be another one.
     What cannot be read or mapped is told in the report. Raises MapFileError where the place cannot be written.
     """
     notes, started = list[str](), perf_counter()
-    home = place / f"{RECORDINGS}/{recording.key(layout)}"
+    home = place / f"{RECORDINGS}/{key}"
     with TemporaryDirectory(prefix="stereovox-") as folder:
         try:
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
@@ -253,17 +254,35 @@ def local(where: str, folder: Path) -> str:
     """Return a recording as this machine can open it: that of an object store is copied to `folder`."""
     if not is_url(where):
         return where
-    above, _, name = where.rstrip("/").rpartition("/")
-    place, files = Place.of(above), list[str]()
-    for file in place.names(name):
-        if file == name or file.startswith(f"{name}/"):
-            target = folder / file
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(place.read(file))
-            files.append(file)
+    place, files = _stored(where)
     if not files:
         raise MapFileError(f"{where}: no such recording in the store; check the name")
-    return str(folder / name)
+    for file in files:
+        data = place.read(file)
+        target = folder / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    return str(folder / where.rstrip("/").rpartition("/")[2])
+
+
+def _stored(where: str) -> tuple[Bucket, dict[str, list[Any]]]:
+    """Return the place above a recording in an object store, and what `Bucket.versions` says of its files."""
+    above, _, name = where.rstrip("/").rpartition("/")
+    place = Bucket(above)
+    found = place.versions(f"{name}/")
+    return place, found or {file: one for file, one in place.versions(name).items() if file == name}
+
+
+def _below(folder: str) -> Iterator[str]:
+    """Yield all files below a folder, also behind links, but no folder twice: links may lead back up."""
+    known: set[str] = set()
+    for above, folders, names in os.walk(folder, followlinks=True):
+        if (real := os.path.realpath(above)) in known:
+            folders.clear()
+            continue
+        known.add(real)
+        folders.sort()
+        yield from (os.path.join(above, name) for name in names)
 
 
 def _fetched(
@@ -310,14 +329,19 @@ def _listed(file: Path) -> list[Recording]:
 
 
 def fingerprint(where: str) -> list[Any]:
-    """Return names, sizes and times of the files of a recording; nothing for simulations."""
+    """Return names, sizes and times of the files of a recording (of an object store their tags); no file must be there.
+
+    Folders that are links are followed.
+    """
     if is_url(where):
-        above, _, name = where.rstrip("/").rpartition("/")
-        return list(Place.of(above).sizes(name).items())
-    path = Path(file_part(where))
-    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
-    stats = ((file, file.stat()) for file in files)
-    return [[str(file.relative_to(path)), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+        return list(_stored(where)[1].items())
+    path = file_part(where)
+    found: list[list[Any]] = []
+    for file in [path] if os.path.isfile(path) else _below(path):
+        with suppress(OSError):  # a link that leads nowhere
+            stat = os.stat(file)
+            found.append([os.path.relpath(file, path), stat.st_size, stat.st_mtime_ns])
+    return sorted(found)
 
 
 def _damaged(place: Place, key: str, why: object) -> MapFileError:

@@ -277,9 +277,25 @@ def test_names_of_recordings(tmp_path):
     ):
         with pytest.raises(StereovoxError, match=said):
             recordings_of(wrong)
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    for names in ([f"{tmp_path}/*"], [tmp_path / "a", f"{tmp_path}/b/../a/"]):
+        with pytest.raises(StereovoxError, match=rf"is named twice, also as {tmp_path}/a;"):
+            recordings_of(names)
+    assert len(recordings_of([f"{recording(1)}?depth=/a", f"{recording(1)}?depth=/b"])) == 2
     (tmp_path / "list.txt").write_text("a b c\n")
     with pytest.raises(StereovoxError, match=r"list\.txt:1: 3 words"):
         recordings_of([f"@{tmp_path / 'list.txt'}"])
+
+
+def test_patterns_leave_out_what_lies_beside_recordings(tmp_path):
+    """Calibrations beside KITTI's drives, and the map itself; a file that may be a broken recording is not passed over."""
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "calib_cam_to_cam.txt").write_text("K_00: 1\n")
+    (tmp_path / "empty.bag").write_text("")
+    sv.VoxelMap.from_cells(sv.load_config(), [[0, 0, 0]], [1.0]).save(tmp_path / "city.svox")
+    assert [Path(one.where).name for one in recordings_of([f"{tmp_path}/*"])] == ["drive", "empty.bag"]
+    with pytest.raises(StereovoxError, match="no recording has such a name"):
+        recordings_of([f"{tmp_path}/calib*"])
 
 
 def test_no_scheduler_is_one_line(tmp_path, monkeypatch):

@@ -31,7 +31,8 @@ from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
 from stereovox.maps.kept_frames import KeptFrame
-from stereovox.maps.store import MANIFEST, MAX_MANIFEST
+from stereovox.maps.store import MANIFEST, MAX_MANIFEST, is_map
+from stereovox.opening import is_recording
 from stereovox.places import Bucket, Folder, Place, is_url
 from stereovox.pose_choice import GIVEN
 from stereovox.remapping import remap
@@ -43,6 +44,8 @@ VERSION = 1
 """Of what is kept of a recording; another one is made anew."""
 RECORDINGS = "recordings"
 SEEN, REPORT = "seen.npy", "report.json"
+TEXTS = (".txt", ".md", ".csv", ".json", ".yaml", ".yml", ".toml", ".log")
+"""Endings of files that lie beside recordings and hold text."""
 MAX_REPORT = 1 << 24
 """Bytes of a report."""
 
@@ -99,19 +102,24 @@ def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
             file of its corrected poses if there is one; # begins a comment), or `Recording`.
 
     Returns:
-        The recordings; none twice.
+        The recordings; none twice. A pattern leaves out maps, and files of text that are no recordings.
 
     Raises:
-        StereovoxError: A pattern fits nothing, a list cannot be read, there is no recording, or one is named twice.
+        StereovoxError: A pattern fits nothing, a list cannot be read, there is no recording, or one is named twice,
+            also by the name of a link.
     """
     found: list[Recording] = []
     for name in names:
         found += [name] if isinstance(name, Recording) else _expanded(str(name))
     if not found:
         raise StereovoxError("no recording is named; give one or more")
-    twice = next((one.where for n, one in enumerate(found) if one.where in {other.where for other in found[:n]}), None)
-    if twice is not None:
-        raise StereovoxError(f"{twice}: is named twice; name it once")
+    known: dict[str, str] = {}
+    for one in found:
+        real = _real(one.where)
+        if real in known:
+            also = "" if known[real] == one.where else f", also as {known[real]}"
+            raise StereovoxError(f"{one.where}: is named twice{also}; name it once")
+        known[real] = one.where
     return found
 
 
@@ -304,10 +312,23 @@ def _expanded(name: str) -> list[Recording]:
         return _listed(Path(name[1:]))
     if any(letter in name for letter in "*[") and not is_url(name) and not os.path.exists(name):
         found = sorted(glob.glob(name, recursive=True))
-        if not found:
-            raise StereovoxError(f"{name}: nothing has such a name; check the pattern")
-        return [Recording(one) for one in found]
+        drives = [one for one in found if not _lies_beside(one)]
+        if not drives:
+            what = "no recording" if found else "nothing"
+            raise StereovoxError(f"{name}: {what} has such a name; check the pattern")
+        return [Recording(one) for one in drives]
     return [Recording(name)]
+
+
+def _lies_beside(path: str) -> bool:
+    """Tell whether what a pattern fits is no recording but lies beside some: a map, or text such as calibrations."""
+    return is_map(path) or (path.lower().endswith(TEXTS) and os.path.isfile(path) and not is_recording(path))
+
+
+def _real(where: str) -> str:
+    """Return what is the same for all names of a recording: links are followed, options stay."""
+    path = file_part(where)
+    return where.rstrip("/") if not os.path.exists(path) else os.path.realpath(path) + where.removeprefix(path)
 
 
 def _listed(file: Path) -> list[Recording]:

@@ -171,7 +171,17 @@ def test_a_broken_recording_is_told_and_left_out(mapped, tmp_path):
     assert len(made.summary()["doubts"]) == 2
     assert "\n" not in "".join(one.error for one in reports)
     with pytest.raises(StereovoxError, match="not one recording could be used"):
-        mapped(["sim:nowhere"], tmp_path / "n.svox")
+        mapped(["sim:nowhere"], tmp_path / "n.svox", voxel_size=0.1)
+    assert not (tmp_path / "n.svox").exists()  # the next run may have other settings
+
+
+def test_a_map_of_no_fleet_is_left_alone(mapped, where):
+    sv.save_boxed(alone(recording(2)), where, 3.2)
+    before = sv.load_map(where).storage.blocks()
+    for resume in (False, True):
+        with pytest.raises(MapFileError, match="no fleet made"):
+            mapped([recording(1)], where, resume=resume)
+    assert_same(sv.load_map(where).storage.blocks(), before)
 
 
 def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, tmp_path):
@@ -258,6 +268,10 @@ def test_a_map_is_gone_on_with_as_it_was_made(mapped, scheduler, tmp_path):
     for other in ({"voxel_size": 0.1}, {"box_m": 6.4}):
         with pytest.raises(MapFileError, match="made with other settings"):
             mapped([recording(1)], tmp_path / "m.svox", resume=True, **other)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fleet, "survey", None)  # another first recording may suggest other settings
+        both = [recording(2), recording(1)]
+        map_fleet(both, tmp_path / "m.svox", resume=True, scheduler=scheduler, box_m=3.2, voxel_size=0.2)
     (tmp_path / "m.svox/fleet.json").write_text("{}")
     with pytest.raises(MapFileError, match=r"fleet\.json: is damaged"):
         mapped([recording(1)], tmp_path / "m.svox", resume=True)

@@ -149,6 +149,8 @@ def map_fleet(
             reports = _indexed(run, place, keys, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
+                if not place.names(f"{RECORDINGS}/") and place.find(MANIFEST) is None:
+                    place.remove([SETTINGS])  # the next run begins anew
                 first = reports[listed[0]]
                 raise StereovoxError(
                     f"not one recording could be used, no map is written ({first.recording}: {first.error})"
@@ -222,17 +224,18 @@ def _layout(
 ) -> BoxLayout:
     """Return settings and boxes, those of a run before where one is gone on with."""
     known = _known_layout(place)
-    if not resume and (known is not None or place.find(MANIFEST) is not None):
+    if known is None and place.find(MANIFEST) is not None:
+        raise MapFileError(f"{place}: is a map that no fleet made, and would be lost; choose another name")
+    if known is not None and not resume:
         raise MapFileError(f"{place}: there is a map already; go on with it with --resume, or choose another name")
-    if known is not None and profile is None and not overrides and box_m is None:
-        return known
-    config, lines = settings_for(listed, profile, overrides)
+    config, lines = settings_for(listed, known.config if known is not None and profile is None else profile, overrides)
     layout = BoxLayout(config, known.side if known is not None and box_m is None else box_side(box_m, config))
     if known is not None and (_settings(layout) != _settings(known)):
         raise MapFileError(f"{place}: was made with other settings; leave them out to go on, or choose another name")
     for line in lines:
         notify(f"note: {line}")
-    place.write(SETTINGS, json.dumps(_settings(layout)).encode())
+    if known is None:
+        place.write(SETTINGS, json.dumps(_settings(layout)).encode())
     return layout
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps made by many workers are those of one machine, bit for bit, however they are cut, killed and gone on with."""
 
+import json
 import os
 import shutil
 import signal
@@ -21,6 +22,7 @@ from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings_of
 from stereovox.fleet.recordings import boxes_with, fingerprint, local
+from stereovox.maps import pyramid
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
 from stereovox.places import Place
@@ -159,6 +161,35 @@ def test_what_was_done_before_a_failure_stays(mapped, where, monkeypatch):
     assert 0 < made.boxes[1] <= made.boxes[0] - 2
     assert_same(made.map.storage.blocks(), alone(recording(1)).storage.blocks())
     assert not Place.of(where).names("done/")
+
+
+def test_boxes_that_are_gone_are_mapped_again(mapped, tmp_path, monkeypatch):
+    """A box of the map that was removed, and word of a box that was swept since."""
+    monkeypatch.setattr(pyramid, "SMALL", 100)
+    where = tmp_path / "m.svox"
+    made, place = mapped([recording(1)], where, box_m=6.4), Place.of(where)
+    levels = made.map.manifest.levels
+    assert sum(map(len, levels)) > 1
+    gone = made.map.manifest.boxes[2], levels[0][0]
+    for entry in gone:
+        place.remove(place.names(f"{entry.name}/cells/"))
+    again = mapped([recording(1)], where, box_m=6.4, resume=True)
+    assert (again.boxes[1], again.map.manifest.levels) == (1, levels)
+    assert_same(sv.load_map(where).storage.blocks(), alone(recording(1)).storage.blocks())
+    inputs = next(name for name, box in made.map.manifest.extra["fleet"]["boxes"].items() if box == gone[0].box)
+    word = json.dumps(boxes.saved(boxes.DoneBox(gone[0]._replace(name=f"{gone[0].name[:-16]}{16 * '0'}"), 1.0)))
+    place.remove(["manifest.json", *place.names(f"{gone[0].name}/")])
+    place.write(f"done/{inputs}.json", word.encode())
+    assert mapped([recording(1)], where, box_m=6.4, resume=True).boxes[1] == made.boxes[0]
+    assert_same(sv.load_map(where).storage.blocks(), alone(recording(1)).storage.blocks())
+
+
+def test_levels_of_boxes_that_stay_are_not_made_again(mapped, tmp_path, monkeypatch):
+    monkeypatch.setattr(pyramid, "SMALL", 100)
+    made = mapped([recording(1)], tmp_path / "m.svox")
+    monkeypatch.setattr(fleet, "write_parent", None)
+    again = mapped([recording(1)], tmp_path / "m.svox", resume=True)
+    assert again.map.manifest.levels == made.map.manifest.levels != []
 
 
 def test_a_broken_recording_is_told_and_left_out(mapped, tmp_path):
@@ -302,7 +333,7 @@ def test_names_of_recordings(tmp_path):
 
 
 def test_patterns_leave_out_what_lies_beside_recordings(tmp_path):
-    """Calibrations beside KITTI's drives, and the map itself; a file that may be a broken recording is not passed over."""
+    """Calibrations of KITTI, and the map itself; a file that may be a broken recording is not passed over."""
     (tmp_path / "drive").mkdir()
     (tmp_path / "calib_cam_to_cam.txt").write_text("K_00: 1\n")
     (tmp_path / "empty.bag").write_text("")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
@@ -15,8 +15,11 @@ from stereovox.deadline import Levels
 from stereovox.fleet.recordings import digest, frames_of
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS
-from stereovox.maps.boxes import BoxEntry, BoxLayout, Index, write_box
+from stereovox.maps.boxed_manifest import read_boxed_manifest
+from stereovox.maps.boxes import BOXES, BoxEntry, BoxLayout, Index, is_there, write_box
 from stereovox.maps.evidence import Evidence
+from stereovox.maps.pyramid import coarser_layout, families, names_of
+from stereovox.maps.store import MANIFEST
 from stereovox.places import Place
 from stereovox.safe_io import json_value
 
@@ -101,13 +104,50 @@ def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
     return done
 
 
-def done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:
-    """Return a box that a run before has mapped from the same frames, None where there is none."""
-    data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
-    try:
-        return None if data is None else loaded(json_value(data), layout)
-    except (KeyError, TypeError, ValueError):
-        return None  # it is mapped again
+class BoxesBefore:
+    """What runs before have left at a place and can be used: boxes whose files are there, whoever removed others.
+
+    A run that was killed, or a task that nobody waits for any more, may have left word of boxes that were swept.
+    """
+
+    def __init__(self, place: Place):
+        self._place, self._sizes = place, place.sizes(f"{BOXES}/")
+        self._manifest = None if place.find(MANIFEST) is None else read_boxed_manifest(place)
+
+    def boxes(self, layout: BoxLayout, wanted: Iterable[str]) -> dict[str, DoneBox]:
+        """Return boxes by what they are made of, those of `wanted` that are there."""
+        files = {file.rpartition("/")[2].removesuffix(".json") for file in self._place.names(f"{DONE}/")}
+        named = self._named()
+        found = {
+            inputs: named[inputs] if inputs in named else _done_before(self._place, layout, inputs)
+            for inputs in wanted
+            if inputs in named or inputs in files
+        }
+        return {
+            inputs: box
+            for inputs, box in found.items()
+            if box is not None and (box.entry is None or is_there(layout, box.entry, self._sizes))
+        }
+
+    def parents(self, layout: BoxLayout) -> dict[frozenset[str], BoxEntry | None]:
+        """Return boxes of the level above that of `layout` by the names of those they cover; None: no cell is known."""
+        if self._manifest is None or len(self._manifest.levels) <= layout.level:
+            return {}
+        level, above = [self._manifest.boxes, *self._manifest.levels][layout.level :][:2]
+        there, coarser = {entry.box: entry for entry in above}, coarser_layout(layout)
+        found = {names_of(family): there.get(box) for box, family in families(level).items()}
+        return {names: box for names, box in found.items() if box is None or is_there(coarser, box, self._sizes)}
+
+    def _named(self) -> dict[str, DoneBox]:
+        """Return the boxes that the manifest names, by what they are made of."""
+        if self._manifest is None:
+            return {}
+        entries = {entry.box: entry for entry in self._manifest.boxes}
+        try:
+            known = self._manifest.extra["fleet"]["boxes"].items()
+            return {inputs: DoneBox(None if box is None else entries[tuple(box)], 0.0) for inputs, box in known}
+        except (KeyError, TypeError, AttributeError):
+            return {}  # all are mapped
 
 
 def saved(done: DoneBox) -> list[object]:
@@ -119,6 +159,15 @@ def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
     """Return a saved box. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
     entry, seconds = values
     return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))  # pyright: ignore[reportArgumentType]
+
+
+def _done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:
+    """Return a box that a run before has mapped from the same frames, None where there is none."""
+    data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
+    try:
+        return None if data is None else loaded(json_value(data), layout)
+    except (KeyError, TypeError, ValueError):
+        return None  # it is mapped again
 
 
 def _within(evidence: Evidence, low: NDArray[np.int64], high: NDArray[np.int64]) -> Evidence:

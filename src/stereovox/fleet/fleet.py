@@ -13,7 +13,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
-from stereovox.fleet.boxes import DONE, Box, DoneBox, boxes_of, done_before, map_box
+from stereovox.fleet.boxes import DONE, Box, BoxesBefore, DoneBox, boxes_of, map_box
 from stereovox.fleet.cluster import Cluster, cluster
 from stereovox.fleet.recordings import (
     RECORDINGS,
@@ -35,7 +35,7 @@ from stereovox.maps.boxed_manifest import (
 )
 from stereovox.maps.boxed_map import USUAL_SIDE, BoxedMap, check_boxed_target, side_of
 from stereovox.maps.boxes import MAX_SIDE, BoxEntry, BoxLayout
-from stereovox.maps.pyramid import coarser_layout, families, is_top, write_parent
+from stereovox.maps.pyramid import coarser_layout, families, is_top, names_of, write_parent
 from stereovox.maps.store import MANIFEST, viewpoint_from
 from stereovox.opening import open_source
 from stereovox.places import Place
@@ -156,19 +156,19 @@ def map_fleet(
                     f"not one recording could be used, no map is written ({first.recording}: {first.error})"
                 )
             _check_still_there(place, reports)
-            boxes, before = _boxes(place, layout, [(keys[one], reports[one].frames) for one in used]), _done(place)
-            done = _mapped(run, place, layout, boxes, before, progress)
+            boxes = _boxes(place, layout, [(keys[one], reports[one].frames) for one in used])
+            before = BoxesBefore(place)
+            done, mapped = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
-            levels = _levels(run, place, layout, entries, progress)
+            levels = _levels(run, place, layout, entries, before, progress)
         inputs = {inputs: None if box.entry is None else box.entry.box for inputs, box in done.items()}
         manifest = _manifest(place, layout, {one: keys[one] for one in used}, entries, levels, inputs)
         write_boxed_manifest(place, manifest)
         _sweep(place, manifest, {keys[one] for one in used})
-    made = [box for inputs, box in done.items() if inputs not in before]
     return FleetMap(
-        BoxedMap(place, manifest), str(out), [reports[one] for one in listed], (len(boxes), len(made)),
+        BoxedMap(place, manifest), str(out), [reports[one] for one in listed], (len(boxes), len(mapped)),
         sum(box.frames for box in boxes),
-        (perf_counter() - started, sum(one.seconds for one in (*made, *reports.values()))),
+        (perf_counter() - started, sum(one.seconds for one in (*mapped, *reports.values()))),
     )  # fmt: skip
 
 
@@ -290,53 +290,43 @@ def _check_still_there(place: Place, reports: Mapping[Recording, RecordingReport
             )
 
 
-def _done(place: Place) -> dict[str, DoneBox]:
-    """Return the boxes that a manifest names, by what they are made of."""
-    if place.find(MANIFEST) is None:
-        return {}
-    manifest = read_boxed_manifest(place)
-    entries = {entry.box: entry for entry in manifest.boxes}
-    try:
-        known = manifest.extra["fleet"]["boxes"].items()
-        return {inputs: DoneBox(None if box is None else entries[tuple(box)], 0.0) for inputs, box in known}
-    except (KeyError, TypeError, AttributeError):
-        return {}  # of no fleet: all are mapped
-
-
 def _mapped(
-    run: Cluster, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: dict[str, DoneBox], progress: Progress
-) -> dict[str, DoneBox]:
-    """Return all boxes by what they are made of; those that no run before has mapped are mapped."""
-    names = {box.inputs(layout): box for box in boxes}
-    before |= {
-        inputs: box
-        for file in place.names(f"{DONE}/")
-        if (inputs := file.rpartition("/")[2].removesuffix(".json")) in names
-        and (box := done_before(place, layout, inputs)) is not None
-    }
-    done = {inputs: before[inputs] for inputs in names if inputs in before}
+    run: Cluster, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: BoxesBefore, progress: Progress
+) -> tuple[dict[str, DoneBox], list[DoneBox]]:
+    """Return all boxes by what they are made of, and those of them that no run before has mapped, which are mapped."""
+    names, mapped = {box.inputs(layout): box for box in boxes}, list[DoneBox]()
+    done = before.boxes(layout, names)
     tasks = {inputs: (place, layout, box) for inputs, box in names.items() if inputs not in done}
     progress(len(done), len(names), "boxes")
     for inputs, box in run.results(map_box, tasks, {inputs: names[inputs].frames for inputs in tasks}):
         done[inputs] = box
+        mapped.append(box)
         progress(len(done), len(names), "boxes")
-    return done
+    return done, mapped
 
 
 def _levels(
-    run: Cluster, place: Place, layout: BoxLayout, entries: Sequence[BoxEntry], progress: Progress
+    run: Cluster,
+    place: Place,
+    layout: BoxLayout,
+    entries: Sequence[BoxEntry],
+    before: BoxesBefore,
+    progress: Progress,
 ) -> list[list[BoxEntry]]:
-    """Return the coarser levels, each made of the one before."""
+    """Return the coarser levels, each made of the one before where a run before has not made it of the same boxes."""
     levels: list[list[BoxEntry]] = []
     while not is_top(entries):
+        of, known = {names_of(family): family for family in families(entries).values()}, before.parents(layout)
+        made = {names: known[names] for names in of if names in known}
         tasks = {
             f"{layout.level}-{'-'.join(entry.name[-16:] for entry in family)}": (place, layout, family)
-            for family in families(entries).values()
+            for names, family in of.items()
+            if names not in made
         }
-        parents: list[BoxEntry] = []
-        for n, (_, parent) in enumerate(run.results(write_parent, tasks), 1):
+        parents = [parent for parent in made.values() if parent is not None]
+        for n, (_, parent) in enumerate(run.results(write_parent, tasks), len(made) + 1):
             parents += [] if parent is None else [parent]
-            progress(n, len(tasks), "coarser levels")
+            progress(n, len(of), "coarser levels")
         entries, layout = sorted(parents), coarser_layout(layout)
         levels.append(list(entries))
     return levels
@@ -360,7 +350,7 @@ def _manifest(
 
 
 def _sweep(place: Place, manifest: BoxedManifest, keys: set[str]) -> None:
-    """Remove what the map is not made of any more."""
-    sweep_boxes(place, manifest.names)
+    """Remove what the map is not made of any more, word of boxes before the boxes."""
     old = [file for file in place.names(f"{RECORDINGS}/") if file.split("/")[1] not in keys]
-    place.remove([*old, *place.names(f"{DONE}/")])
+    place.remove([*place.names(f"{DONE}/"), *old])
+    sweep_boxes(place, manifest.names)

@@ -13,7 +13,7 @@ import hashlib
 import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from math import ceil
 from typing import Any, NamedTuple
@@ -216,6 +216,12 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
             f"{place}/{entry.name}: damaged box ({type(error).__name__}: {error}); make box {entry.box} anew"
         ) from None
     return BoxBlocks(coords, cells, times[0] if times else None, entry.times_start_ns)
+
+
+def is_there(layout: BoxLayout, entry: BoxEntry, sizes: Mapping[str, int]) -> bool:
+    """Tell whether the arrays of a box are complete among the files of a place, whose bytes these are."""
+    shards = [f"{entry.name}/{_shard(name)}" for name in ARRAYS[: len(layout.dtypes)]]
+    return all(name in sizes for name in shards) and sum(sizes[name] for name in shards) == entry.bytes
 
 
 def _shard(name: str) -> str:

@@ -52,6 +52,11 @@ def families(entries: Iterable[BoxEntry]) -> dict[Index, list[BoxEntry]]:
     return dict(found)
 
 
+def names_of(family: Iterable[BoxEntry]) -> frozenset[str]:
+    """Return what stands for the content of a family: boxes are named after theirs."""
+    return frozenset(entry.name for entry in family)
+
+
 def write_parent(place: Place, layout: BoxLayout, children: Sequence[BoxEntry]) -> BoxEntry | None:
     """Write the box of the next level that covers `children`, all boxes of one family; return its entry.
 

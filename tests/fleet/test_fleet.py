@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps made by many workers are those of one machine, bit for bit, however they are cut, killed and gone on with."""
 
+import errno
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from uuid import uuid4
 
 import numpy as np
@@ -20,7 +22,7 @@ import stereovox as sv
 from made_clouds import room_cloud
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
-from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings_of
+from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings, recordings_of
 from stereovox.fleet.recordings import boxes_with, fingerprint, local
 from stereovox.maps import pyramid
 from stereovox.maps.boxes import BoxLayout
@@ -213,6 +215,57 @@ def test_a_map_of_no_fleet_is_left_alone(mapped, where):
         with pytest.raises(MapFileError, match="no fleet made"):
             mapped([recording(1)], where, resume=resume)
     assert_same(sv.load_map(where).storage.blocks(), before)
+
+
+def test_a_recording_that_may_not_be_read_is_told_and_left_out(mapped, tmp_path, monkeypatch):
+    mapped_alone = recordings._mapped_alone
+
+    def refused(one, *given):
+        if one.where == recording(2):
+            raise PermissionError(errno.EACCES, "Permission denied", "poses.txt")
+        return mapped_alone(one, *given)
+
+    monkeypatch.setattr(recordings, "_mapped_alone", refused)
+    made = mapped([recording(1), recording(2)], tmp_path / "m.svox")
+    assert made.recordings[1].error == "poses.txt: Permission denied; check that you may read it"
+    assert_same(made.map.storage.blocks(), alone(recording(1)).storage.blocks())
+
+
+@pytest.mark.parametrize("system", [True, False])
+def test_a_worker_without_room_does_not_leave_recordings_out(mapped, tmp_path, monkeypatch, system):
+    def full(one, layout, folder, notes):
+        if system:
+            raise OSError(errno.ENOSPC, "No space left on device", str(folder))
+        raise MapFileError(f"{folder}/map: cannot save the map (No space left on device)")
+
+    monkeypatch.setattr(recordings, "_mapped_alone", full)
+    with pytest.raises(StereovoxError, match=r"stereovox-.*No space left on device") as error:
+        mapped([recording(1)], tmp_path / "m.svox")
+    assert "cluster" not in str(error.value)
+    assert "not one recording" not in str(error.value)
+
+
+def test_what_kills_workers_is_named(scheduler):
+    def dies(task):
+        raise distributed.KilledWorker(task, SimpleNamespace(address=""), 20)
+
+    with distributed.Client(scheduler) as client:
+        run = cluster.Cluster(client)
+        with pytest.raises(StereovoxError, match="that had 'drives/a' died"):
+            list(run.results(dies, {"drives/a": (f"dies-{run._name}-drives/a",)}))
+
+
+@pytest.mark.parametrize("kind", ["seen.npy", "manifest.json", "frames-*"])
+def test_damage_of_what_is_kept_is_told_with_the_cure(mapped, tmp_path, kind):
+    mapped([recording(1)], tmp_path / "m.svox", box_m=6.4)
+    (tmp_path / "m.svox/manifest.json").unlink()
+    for file in (tmp_path / "m.svox/recordings").glob(f"*/{kind}"):
+        file.write_bytes(file.read_bytes()[:-9] if kind == "frames-*" else b"")
+    with pytest.raises(MapFileError, match=r"recordings/\w+: is damaged .*; remove it and run again with --resume"):
+        mapped([recording(1)], tmp_path / "m.svox", box_m=6.4, resume=True)
+    shutil.rmtree(tmp_path / "m.svox/recordings")
+    mapped([recording(1)], tmp_path / "m.svox", box_m=6.4, resume=True)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
 
 
 def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.deadline import Levels
-from stereovox.fleet.recordings import digest, frames_of
+from stereovox.fleet.recordings import digest, frames_of, read_frame
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.boxed_manifest import read_boxed_manifest
@@ -95,7 +95,7 @@ def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
         with frames_of(place, piece.recording, piece.numbers) as frames:
             for frame in frames:
                 level = levels(frame.quality)
-                image = level.prepare(frame.frame()).image
+                image = level.prepare(read_frame(place, piece.recording, frame)).image
                 storage.history.frames = piece.before + frame.number
                 storage.look_from(image.viewpoint)
                 storage.add(_within(level.integrator.evidence(image), low, high))

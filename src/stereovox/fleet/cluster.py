@@ -46,10 +46,11 @@ class Cluster:
         }  # fmt: skip
         try:
             for future in as_completed(list(submitted)):
-                yield submitted[future], future.result()
+                yield submitted[future], _result(future)
         except KilledWorker as error:
+            name = str(error.task).partition(f"{self._name}-")[2]
             raise StereovoxError(
-                f"the workers that had '{error.task}' died {LOST_WORKERS} times (too little memory?); what is done "
+                f"the workers that had '{name}' died {LOST_WORKERS} times (too little memory?); what is done "
                 "stays, go on with --resume"
             ) from None
         except (OSError, TimeoutError) as error:
@@ -60,6 +61,16 @@ class Cluster:
             raise StereovoxError("the scheduler is lost; what is done stays, go on with --resume") from None
         finally:
             self._client.cancel(list(submitted), force=True)
+
+
+def _result(future: Any) -> Any:
+    """Return the result of a task that ended; raises StereovoxError for an error of its worker's system."""
+    if future.status == "error" and isinstance(error := future.exception(), OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        raise StereovoxError(
+            f"a worker cannot go on ({where}{error.strerror or error}); what is done stays, go on with --resume"
+        )
+    return future.result()
 
 
 @contextmanager

@@ -7,6 +7,7 @@ boxes each sees, and the history of the map that they made. The key is made of a
 
 from __future__ import annotations
 
+import errno
 import glob
 import hashlib
 import io
@@ -25,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError, StereovoxError, without_name
+from stereovox.errors import MapFileError, StereovoxError
+from stereovox.frame import Cloud, Frame
 from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
@@ -134,8 +136,8 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     with TemporaryDirectory(prefix="stereovox-") as folder:
         try:
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
-        except StereovoxError as error:
-            return RecordingReport(recording.where, error=without_name(error, recording.where), notes=notes)
+        except (StereovoxError, OSError) as error:
+            return RecordingReport(recording.where, error=why_not(recording.where, error, Path(folder)), notes=notes)
         manifest = json_value((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
             home.write(name, (made / name).read_bytes())
@@ -150,6 +152,20 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     return report
 
 
+def why_not(where: str, error: StereovoxError | OSError, folder: Path) -> str:
+    """Return in one line why a recording cannot be used.
+
+    Raises the error itself where it is not the recording's: in `folder`, for its copy and its map, is no room.
+    """
+    if isinstance(error, OSError):
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise error
+        return f"{error.filename or where}: {error.strerror or error}; check that you may read it"
+    if isinstance(error, MapFileError) and str(folder) in str(error):
+        raise error
+    return str(error).removeprefix(f"{where}: ")
+
+
 def report_of(place: Place, key: str) -> RecordingReport | None:
     """Return the report of a recording that was indexed before, None where it was not."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
@@ -160,11 +176,14 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
 
 
 def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
-    """Return which trusted frames of a recording see which boxes: (n, 4) number and index, by number."""
+    """Return which trusted frames of a recording see which boxes: (n, 4) number and index, by number.
+
+    Raises MapFileError where that is damaged.
+    """
     data = (place / f"{RECORDINGS}/{key}").read(SEEN)
     try:
         rows = np.load(io.BytesIO(data), allow_pickle=False)
-    except ValueError as error:
+    except (ValueError, EOFError) as error:
         raise _damaged(place, key, error) from None
     if rows.ndim != 2 or rows.shape[1] != 4 or rows.dtype != np.int32:
         raise _damaged(place, key, f"{SEEN} holds {rows.dtype} {rows.shape}")
@@ -172,26 +191,35 @@ def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
 
 
 def manifest_of(place: Place, key: str) -> dict[str, Any]:
-    """Return the manifest of the map that a recording made alone."""
-    return json_value((place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST))
+    """Return the manifest of the map that a recording made alone. Raises MapFileError where it is damaged."""
+    data = (place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST)
+    try:
+        manifest = json_value(data)
+        files_of_frames(manifest["kept_frames"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(place, key, error) from None
+    return manifest
 
 
 @contextmanager
 def frames_of(place: Place, key: str, numbers: Sequence[int]) -> Iterator[Iterator[KeptFrame]]:
     """Yield some of the trusted frames of a recording, ascending; of an object store each pack is fetched once."""
     home, saved = place / f"{RECORDINGS}/{key}", manifest_of(place, key)["kept_frames"]
+    if isinstance(home, Folder):
+        frames = _kept(place, key, home.path, saved)
+        yield (frames[n] for n in numbers)
+        return
+    with TemporaryDirectory(prefix="stereovox-") as folder:
+        (Path(folder) / str(saved["index"])).write_bytes(home.read(str(saved["index"])))
+        frames = _kept(place, key, Path(folder), saved)
+        yield _fetched(home, Path(folder), saved["packs"], frames, numbers)
+
+
+def read_frame(place: Place, key: str, frame: KeptFrame) -> Frame | Cloud:
+    """Return one of these frames. Raises MapFileError where it is damaged."""
     try:
-        if isinstance(home, Folder):
-            kept = read_frames(home.path, saved, None)
-            assert kept is not None
-            yield (kept.frames[n] for n in numbers)
-            return
-        with TemporaryDirectory(prefix="stereovox-") as folder:
-            (Path(folder) / saved["index"]).write_bytes(home.read(saved["index"]))
-            kept = read_frames(Path(folder), saved, None)
-            assert kept is not None
-            yield _fetched(home, Path(folder), saved["packs"], kept.frames, numbers)
-    except (KeyError, TypeError, ValueError, OSError) as error:
+        return frame.frame()
+    except MapFileError as error:
         raise _damaged(place, key, error) from None
 
 
@@ -291,6 +319,16 @@ def _below(folder: str) -> Iterator[str]:
         known.add(real)
         folders.sort()
         yield from (os.path.join(above, name) for name in names)
+
+
+def _kept(place: Place, key: str, folder: Path, saved: Any) -> Sequence[KeptFrame]:
+    """Return the trusted frames of a recording, the index of which is in `folder`."""
+    try:
+        kept = read_frames(folder, saved, None)
+        assert kept is not None
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise _damaged(place, key, error) from None
+    return kept.frames
 
 
 def _fetched(

@@ -20,8 +20,8 @@ from stereovox.evaluate.metrics import Confusion
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.fleet.cluster import cluster
-from stereovox.fleet.fleet import Progress, suggested
-from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of
+from stereovox.fleet.fleet import Progress
+from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of, why_not
 from stereovox.maps.boxed_manifest import only_writer_at
 from stereovox.maps.store import MANIFEST
 from stereovox.opening import open_source
@@ -199,8 +199,8 @@ def score_recording(
                     truth, _ = lidar_truth(source, *sizes, options.free, options.frames)
                     truths[sizes] = TruthCells(truth, options.tolerance)
                 rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
-            except StereovoxError as error:
-                why = without_name(error, recording.where)
+            except (StereovoxError, OSError) as error:
+                why = why_not(recording.where, error, Path(folder))
                 rows.append(RecordingScore(recording.where, config.profile, error=why))
             rows[-1] = replace(rows[-1], seconds=perf_counter() - started)
     if not any(row.error for row in rows):  # what failed is tried again

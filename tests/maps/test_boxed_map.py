@@ -11,7 +11,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.maps import boxed_map
+from stereovox.maps import boxed_manifest, boxed_map
 from stereovox.maps.boxed_manifest import only_writer_at, read_boxed_manifest
 from stereovox.maps.boxed_map import BoxedMap
 from stereovox.maps.boxes import read_box
@@ -213,6 +213,14 @@ def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
     assert names == read_boxed_manifest(Place.of(where)).names
 
 
+def test_a_manifest_that_could_not_be_read_is_not_written(tmp_path, monkeypatch):
+    before = boxed(tmp_path / "m.svox").storage.blocks()
+    monkeypatch.setattr(boxed_manifest, "MAX_MANIFEST", len((tmp_path / "m.svox/manifest.json").read_bytes()))
+    with pytest.raises(MapFileError, match="choose larger boxes"):
+        sv.save_boxed(sv.load_map(tmp_path / "m.svox"), tmp_path / "n.svox", 0.4)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), before)
+
+
 def test_there_is_one_writer(where):
     place = Place.of(where)
     with only_writer_at(place), ThreadPoolExecutor(1) as other, pytest.raises(MapFileError, match="another"):
@@ -232,7 +240,7 @@ def test_damage_is_told_by_the_box(where):
         sv.load_map(where).storage.blocks()
     assert "\n" not in str(error.value)
     place.remove([name])
-    with pytest.raises(MapFileError, match="is not there"):
+    with pytest.raises(MapFileError, match=f"{entry.name}: is not there; .* load it again"):
         sv.load_map(where).storage.blocks()
 
 

@@ -69,7 +69,8 @@ class BoxedManifest:
 def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
     """Make boxes that are in a place its map; an older one there is replaced at once.
 
-    Raises MapFileError where it cannot be written; the older map is then as it was.
+    Raises MapFileError where it cannot be written, or has so many boxes that it could not be read; the older map is
+    then as it was.
     """
     layout = manifest.layout
     saved = {
@@ -84,7 +85,10 @@ def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
         "levels": [[entry.saved() for entry in sorted(level)] for level in manifest.levels],
         "extra": manifest.extra,
     }
-    place.write(MANIFEST, json.dumps(saved, default=as_number).encode())
+    data = json.dumps(saved, default=as_number).encode()
+    if len(data) > MAX_MANIFEST:
+        raise MapFileError(f"{place}: a manifest of {len(manifest.boxes)} boxes is too large; choose larger boxes")
+    place.write(MANIFEST, data)
 
 
 def read_boxed_manifest(place: Place) -> BoxedManifest:

@@ -198,7 +198,11 @@ def write_blocks(place: Place, layout: BoxLayout, index: Sequence[int], blocks: 
 
 def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
     """Read the blocks of one box. Raises MapFileError, one line that names the box, where it is missing or damaged."""
-    shards = [place.read(f"{entry.name}/{_shard(name)}", entry.bytes) for name in ARRAYS[: len(layout.dtypes)]]
+    files = [f"{entry.name}/{_shard(name)}" for name in ARRAYS[: len(layout.dtypes)]]
+    shards = [data for file in files if (data := place.find(file, entry.bytes)) is not None]
+    if len(shards) < len(files):
+        why = "was the map made anew meanwhile? load it again"
+        raise MapFileError(f"{place}/{entry.name}: is not there; {why}, or make box {entry.box} anew")
     try:
         if tuple(map(zlib.crc32, shards)) != entry.checksum:
             raise ValueError("the cells do not match their checksum")

@@ -214,7 +214,8 @@ def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
 
 
 def test_a_manifest_that_could_not_be_read_is_not_written(tmp_path, monkeypatch):
-    before = boxed(tmp_path / "m.svox").storage.blocks()
+    put_at(tmp_path / "m.svox")
+    before = sv.load_map(tmp_path / "m.svox").storage.blocks()
     monkeypatch.setattr(boxed_manifest, "MAX_MANIFEST", len((tmp_path / "m.svox/manifest.json").read_bytes()))
     with pytest.raises(MapFileError, match="choose larger boxes"):
         sv.save_boxed(sv.load_map(tmp_path / "m.svox"), tmp_path / "n.svox", 0.4)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError, StereovoxError
+from stereovox.errors import MapFileError, StereovoxError, without_name
 from stereovox.frame import Cloud, Frame
 from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
@@ -163,7 +163,7 @@ def why_not(where: str, error: StereovoxError | OSError, folder: Path) -> str:
         return f"{error.filename or where}: {error.strerror or error}; check that you may read it"
     if isinstance(error, MapFileError) and str(folder) in str(error):
         raise error
-    return str(error).removeprefix(f"{where}: ")
+    return without_name(error, where)
 
 
 def report_of(place: Place, key: str) -> RecordingReport | None:

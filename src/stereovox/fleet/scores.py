@@ -14,13 +14,13 @@ from time import perf_counter
 from typing import Any
 
 from stereovox.config import Config, load_config
-from stereovox.errors import MapFileError, StereovoxError, without_name
+from stereovox.errors import MapFileError, StereovoxError
 from stereovox.evaluate.lidar_truth import FREE, lidar_truth
 from stereovox.evaluate.metrics import Confusion
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.fleet.cluster import cluster
-from stereovox.fleet.fleet import Progress
+from stereovox.fleet.fleet import Progress, suggested
 from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of, why_not
 from stereovox.maps.boxed_manifest import only_writer_at
 from stereovox.maps.store import MANIFEST

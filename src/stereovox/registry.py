@@ -19,8 +19,8 @@ def entry_points(group: str) -> metadata.EntryPoints:
 
 
 @lru_cache(maxsize=1)
-def _entry_points(folders: tuple[tuple[str, int], ...]) -> metadata.EntryPoints:
-    return metadata.entry_points()
+def _entry_points(folders: tuple[tuple[str, int], ...]) -> Any:
+    return metadata.entry_points()  # of another type in Python 3.11
 
 
 def _changed_ns(folder: str) -> int:

@@ -86,7 +86,7 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
     Raises `error` where the folder is missing or cannot be written, or the disk is full.
     """
     target = Path(os.path.realpath(path))  # a symbolic link stays one
-    temporary = target.with_name(f".{_short(target)}.{uuid.uuid4().hex[:12]}.new")
+    temporary = target.with_name(f".{short_name(target)}.{uuid.uuid4().hex[:12]}.new")
     try:
         if target.is_dir():
             raise error(f"{path}: is a folder; name a file")
@@ -108,7 +108,7 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
 def sweep_unfinished(*paths: Path) -> None:
     """Remove temporary files of `replacing` for these files after a kill; no one else may be writing them."""
     for target in map(Path, map(os.path.realpath, paths)):
-        left = re.compile(rf"\.{re.escape(_short(target))}\.[0-9a-f]{{12}}\.new")
+        left = re.compile(rf"\.{re.escape(short_name(target))}\.[0-9a-f]{{12}}\.new")
         with suppress(OSError):  # what cannot be removed does no harm
             for entry in target.parent.iterdir():
                 if left.fullmatch(entry.name):
@@ -288,7 +288,7 @@ def read_arrays(path: str | Path, names: Sequence[str], what: str) -> dict[str, 
         return {name: _array(file, f"{name}.npy", sizes[f"{name}.npy"]) for name in names}
 
 
-def _short(target: Path) -> str:
+def short_name(target: Path) -> str:
     """Return a file's name, cut so that a longer name made of it is still valid."""
     return os.fsdecode(os.fsencode(target.name)[:200])
 

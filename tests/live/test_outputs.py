@@ -143,6 +143,24 @@ def test_what_was_recorded_before_the_disk_was_full_is_kept(tmp_path, monkeypatc
     assert 10 < len(open_source(left)) <= 20  # the last megabyte may be missing
 
 
+def test_a_disk_that_is_full_at_the_very_end_costs_the_index_alone(tmp_path, monkeypatch):
+    said = []
+    monkeypatch.chdir(tmp_path)
+
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("stereovox.sources.bags.writer.BagFileWriter._move", full)
+    recorder = Recorder("log.mcap", {"front": T_BODY_OPTICAL}, notify=said.append)
+    for k in range(3):
+        recorder.after(frame(k), UpdateReport())
+    recorder.finish()
+    (left,) = tmp_path.glob("log.mcap.*.unfinished/log/log.mcap")
+    assert "No space left on device" in said[0]
+    assert str(left.relative_to(tmp_path)) in said[0]
+    assert len(open_source(left)) == 3
+
+
 def test_what_is_written_is_flushed_to_the_disk_now_and_then(tmp_path, monkeypatch):
     flushed = threading.Event()
 

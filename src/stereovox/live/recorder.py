@@ -110,7 +110,7 @@ class Recorder:
                     self._bag.sync()
                     due_s = monotonic() + SYNC_S
             if self.counts["images"]:
-                self._bag.__exit__(None, None, None)
+                self._bag.complete()
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
         except Exception as error:  # whatever it is, the user is told, and nobody waits for this thread

@@ -104,6 +104,13 @@ def test_scans_come_back_as_they_are(tmp_path, name, packed):
     assert os.listdir(tmp_path) == [name]
 
 
+def test_a_name_of_the_greatest_length_is_written(tmp_path):
+    name = "字" * 83 + ".mcap"  # 254 bytes
+    with BagWriter(tmp_path / name) as bag:
+        bag.scan(scan())
+    assert os.listdir(tmp_path) == [name]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_depth_with_its_camera(tmp_path, name):
     floats = (whole(2) * 0.00123).astype(np.float32)

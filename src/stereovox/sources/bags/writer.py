@@ -19,7 +19,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.safe_io import sync_file, sync_folder, sync_tree
+from stereovox.safe_io import short_name, sync_file, sync_folder, sync_tree
 from stereovox.se2 import lifted
 from stereovox.se3 import Transform, rigidity_error
 from stereovox.sources.bags.depth_topic import sibling
@@ -72,10 +72,14 @@ class BagWriter:
             self._file.abort()
             return
         try:
-            self._flush_fixed()
+            self.complete()
         except BaseException:
             self._file.abort()
             raise
+
+    def complete(self) -> None:
+        """Complete the recording and put it at `path`; where that fails, it is for `leave` to say what there is."""
+        self._flush_fixed()
         self._file.finish()
 
     def sync(self) -> None:
@@ -265,7 +269,7 @@ class BagFileWriter:
         self._connections: dict[str, Any] = {}
         self._writer: Any = None
         self._target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
-        self._folder = self._target.with_name(f"{self._target.name[:100]}.{uuid.uuid4().hex[:6]}{UNFINISHED}")
+        self._folder = self._target.with_name(f"{short_name(self._target)}.{uuid.uuid4().hex[:6]}{UNFINISHED}")
         self._check()
 
     def open(self) -> None:
@@ -302,13 +306,14 @@ class BagFileWriter:
             raise SourceError(f"{self.path}: the time {stamp_ns} ns must lie between {limit}; shift the clock")
 
     def finish(self) -> None:
-        """Complete the recording and move it into place; an older file of that name is replaced."""
-        try:
-            with self._one_line_errors():
-                self._writer.close()
-                self._move()
-        finally:
-            self.abort()
+        """Complete the recording and move it into place; an older file of that name is replaced.
+
+        Where that fails, what was written is still beside `path`, until `abort`.
+        """
+        with self._one_line_errors():
+            self._writer.close()
+            self._move()
+        self.abort()
 
     def sync(self) -> None:
         """Flush what was written to the disk."""

@@ -14,7 +14,8 @@ def result():
     def flight(seed, collided):
         return {"scene": "sim:hall", "seed": seed, "seconds": 20.0, "collided_s": collided, "done": collided is None,
                 "metres": 7.5, "goals": 2, "clearance_m": 0.24, "coverage": [[0.0, 0.0], [20.0, 0.51]],
-                "room_m": 1.25, "most_room_m": 2.0}  # fmt: skip
+                "room_m": 1.25, "most_room_m": 2.0,
+                "left": {"no way to it": 2, "seen from nowhere": 0} if collided is None else {}}  # fmt: skip
 
     flights = [flight(0, None), flight(1, 20.0)]
     return {"mission": "frontiers", "settings": {"speed": 0.6}, "maps": [], "flights": flights,

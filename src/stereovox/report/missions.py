@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ from stereovox.report import page
 from stereovox.view.coverage import coverage_png
 
 HEADS = ("scene", "flights", "collisions", "ended by itself", "metres", "goals", "least clearance, m",
-         "air known: median", "least", "50 % after, s", "80 %", "room at the end, m", "most there is")  # fmt: skip
+         "air known: median", "least", "50 % after, s", "80 %", "frontiers left", "room at the end, m",
+         "most there is")  # fmt: skip
 FLIGHT_HEADS = ("scene", "seed", "collided, s", "seconds", "ended by itself", "metres", "goals", "clearance, m",
-                "air known", "room, m")  # fmt: skip
+                "air known", "frontiers left", "room, m")  # fmt: skip
 MISSIONS = {
     "frontiers": "Go to the frontier that is nearest along the way, look at it, until none can be reached.",
     "middle": "Find the middle of the room as it is known, look round there, until it stays where it is.",
@@ -23,7 +24,9 @@ WHAT = (
     "A collision: a surface of the scene is nearer to the vehicle's middle than its radius. Clearance: the least "
     "distance from its middle to a surface. Air: the cells of the scene that touch nothing, have something above and "
     "below them, and are connected with the start; known: the map calls them free. Ended by itself: no goal was left; "
-    "else time was up, or it collided. Room: horizontal distance to the nearest surface in the vehicle's heights."
+    "else time was up, or it collided. Frontiers left: known air beside unknown where it ended by itself, and why it "
+    "did not go there; where there is no way, a smaller margin or smaller cells may find one. Room: horizontal "
+    "distance to the nearest surface in the vehicle's heights."
 )
 
 
@@ -41,6 +44,7 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
             f"{one['coverage_median']:.1%}",
             f"{one['coverage_least']:.1%}",
             *(_seconds(one["seconds_to_share"][share]) for share in ("0.5", "0.8")),
+            _left(one["left"]),
             f"{one['room_m_median']:.2f}",
             f"{one['most_room_m_median']:.2f}",
         )
@@ -96,8 +100,14 @@ def _flight(one: dict[str, Any]) -> Sequence[str]:
         str(one["goals"]),
         f"{one['clearance_m']:.2f}",
         f"{one['coverage'][-1][1]:.1%}",
+        _left(one["left"]),
         f"{one['room_m']:.2f}",
     )
+
+
+def _left(left: Mapping[str, int]) -> str:
+    """Return how many frontiers were left, and why."""
+    return ", ".join(f"{number} {why}" for why, number in left.items() if number) or "-"
 
 
 def _seconds(value: float | None) -> str:

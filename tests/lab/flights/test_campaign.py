@@ -53,7 +53,8 @@ def test_processes_change_nothing():
 def row(scene="a", seconds=30.0, collided=None, last=0.9, clearance=0.4):
     coverage = [[0.0, 0.0], [10.0, 0.6], [seconds, last]]
     return {"scene": scene, "seconds": seconds, "collided_s": collided, "done": collided is None, "metres": 10.0,
-            "goals": 3, "clearance_m": clearance, "coverage": coverage, "room_m": 1.0, "most_room_m": 2.0}  # fmt: skip
+            "goals": 3, "clearance_m": clearance, "coverage": coverage, "room_m": 1.0, "most_room_m": 2.0,
+            "left": {"no way to it": 2} if collided is None else {}}  # fmt: skip
 
 
 def test_summaries_count_their_own_scene_and_its_collisions():

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stereovox.lab.flights import explore
 from stereovox.lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, fly
 from stereovox.lab.flights.flight import World
+from stereovox.products.frontiers import Frontier
 
 SHORT = Cruise(seconds=35.0)
 
@@ -17,34 +19,81 @@ def world():
 
 
 def test_exploring_uncovers_the_hall_and_touches_nothing(world):
-    explored, _ = fly(3, Frontiers(), SHORT, world)
-    assert explored.collided_s is None
-    assert explored.clearance_m > SHORT.airframe.radius
-    shares = [share for _, share in explored.coverage]
+    told, _ = fly(3, Frontiers(), SHORT, world)
+    assert told.collided_s is None
+    assert told.clearance_m > SHORT.airframe.radius
+    shares = [share for _, share in told.coverage]
     assert shares[0] == 0
-    after_look = next(share for seconds, share in explored.coverage if seconds >= 10)
+    after_look = next(share for seconds, share in told.coverage if seconds >= 10)
     assert shares[-1] > after_look + 0.1
-    assert explored.goals >= 2
-    assert explored.metres > 3
+    assert told.goals >= 2
+    assert told.metres > 3
 
 
 def test_the_middle_has_more_room_than_the_start(world):
     mission = MiddleOfRoom()
-    explored, _ = fly(3, mission, replace(SHORT, seconds=90.0), world)
-    assert explored.done
-    assert explored.collided_s is None
+    told, _ = fly(3, mission, replace(SHORT, seconds=90.0), world)
+    assert told.done
+    assert told.collided_s is None
     start = world.start(np.random.default_rng([3, 1]))
-    flat = [world.clearance.at(np.array([*place[:2], 1.3])) for place in (explored.place, start)]
+    flat = [world.clearance.at(np.array([*place[:2], 1.3])) for place in (told.place, start)]
     assert flat[0] > 0.9
     assert flat[0] >= flat[1] - 0.1
     assert mission.room_m > 0.8
+
+
+class Straight:
+    """Ways in the open, which end `short` metres before what is asked for."""
+
+    def __init__(self, x: float, short: float = 0.0):
+        self.start, self.short = np.array([x, 0, 1.0]), short
+
+    def way_to(self, goal, near):
+        end = np.asarray(goal) - np.array([self.short, 0, 0])
+        return np.stack([self.start, end]) if self.short <= near else None
+
+
+@pytest.fixture
+def one_frontier(monkeypatch):
+    """Let every map have one frontier at x = 6 m, seen from x = 5 m."""
+    found = [Frontier(np.zeros((20, 3), np.int32), np.array([6.0, 0, 1]), np.array([5.0, 0, 1]))]
+    monkeypatch.setattr(explore, "frontiers", lambda *words, **more: found)
+    return found
+
+
+def test_what_was_looked_at_is_done(one_frontier):
+    mission = Frontiers()
+    assert mission.next(None, Straight(0))[0][-1].tolist() == [5, 0, 1]
+    assert mission.next(None, Straight(5)) is None
+    assert mission.left == {"seen from nowhere": 0, "no way to it": 0, "looked at already": 1}
+
+
+def test_a_way_that_had_to_be_left_is_tried_again_but_not_for_ever(one_frontier):
+    mission = Frontiers()
+    for x in (0, 1, 2):
+        assert mission.next(None, Straight(x)) is not None
+    assert mission.next(None, Straight(3)) is None
+
+
+def test_what_was_looked_at_from_far_is_looked_at_from_near(one_frontier):
+    mission = Frontiers()
+    assert mission.next(None, Straight(0, short=1.5))[0][-1].tolist() == [3.5, 0, 1]
+    assert mission.next(None, Straight(3.5))[0][-1].tolist() == [5, 0, 1]
+    assert mission.next(None, Straight(5)) is None
+
+
+def test_why_frontiers_are_left_is_told(one_frontier):
+    one_frontier.append(replace(one_frontier[0], look_from=None))
+    mission = Frontiers()
+    assert mission.next(None, Straight(0, short=3)) is None
+    assert mission.left == {"seen from nowhere": 1, "no way to it": 1, "looked at already": 0}
 
 
 class Through:
     """A mission that would fly through the nearest wall."""
 
     def __init__(self):
-        self.ways = 0
+        self.ways, self.left = 0, {}
 
     def next(self, voxel_map, ways):
         self.ways += 1
@@ -55,16 +104,16 @@ class Through:
 
 def test_ways_that_are_not_free_are_not_flown(world):
     """The check ahead stops it, whatever the mission says."""
-    explored, _ = fly(3, Through(), replace(SHORT, seconds=90.0), world)
-    assert explored.collided_s is None
-    assert explored.goals == 3
-    assert explored.clearance_m > SHORT.airframe.radius
+    told, _ = fly(3, Through(), replace(SHORT, seconds=90.0), world)
+    assert told.collided_s is None
+    assert told.goals == 3
+    assert told.clearance_m > SHORT.airframe.radius
 
 
 def test_without_the_check_ahead_it_collides_and_that_is_told(world):
     """The control of the test above: a vehicle that takes all before it for its own place flies on."""
-    explored, _ = fly(3, Through(), replace(SHORT, seconds=60.0, own_radius=50.0, camera_hz=2.0), world)
-    assert explored.collided_s is not None
-    assert explored.seconds == explored.collided_s
-    assert explored.clearance_m < SHORT.airframe.radius
-    assert not explored.done
+    told, _ = fly(3, Through(), replace(SHORT, seconds=60.0, own_radius=50.0, camera_hz=2.0), world)
+    assert told.collided_s is not None
+    assert told.seconds == told.collided_s
+    assert told.clearance_m < SHORT.airframe.radius
+    assert not told.done

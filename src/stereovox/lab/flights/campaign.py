@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -98,6 +99,7 @@ def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what all flights in one scene come to; medians are over flights.
 
     `seconds_to_share`: median seconds until a flight knew that share of the air, None where fewer than half came to it.
+    `left`: the frontiers that are left in all of them together, by why they were not gone to.
     """
     mine = [row for row in rows if row["scene"] == scene]
     last = [row["coverage"][-1][1] for row in mine]
@@ -109,6 +111,7 @@ def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "seconds_median": _median(row["seconds"] for row in mine),
         "metres": round(sum(row["metres"] for row in mine), 1),
         "goals": sum(row["goals"] for row in mine),
+        "left": dict(sum((Counter(row["left"]) for row in mine), Counter())),
         "clearance_least_m": round(min(row["clearance_m"] for row in mine), 3),
         "coverage_median": _median(last),
         "coverage_least": round(min(last), 3),

@@ -36,8 +36,11 @@ FACING = 0.5
 NEAR_M, SHORT_M = 0.5, 2.0
 """A way leads to within NEAR_M of where a frontier is seen from; where none does, one that ends SHORT_M short brings
 the vehicle nearer, and it looks from there."""
-SEEN_AGAIN = 0.6
-"""A frontier within so many metres of one that was looked at brings nothing."""
+SEEN_AGAIN, TRIES = 0.6, 3
+"""To look at what lies within so many metres of what was looked at, from within as many of there, brings nothing; nor
+does a way to there that had to be left so often."""
+UNSEEN, NO_WAY, LOOKED_AT = "seen from nowhere", "no way to it", "looked at already"
+"""Why a frontier is left."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,13 @@ class Cruise:
 
 
 class Mission(Protocol):
-    """What chooses goals."""
+    """What chooses goals.
+
+    Attributes:
+        left: Once it is done: how many goals are left that it cannot come to, by why.
+    """
+
+    left: dict[str, int]
 
     def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return a way (N, 3) and the place (3,) to look at from its end, NaN to look all round; None: it is done."""
@@ -88,15 +97,16 @@ class MiddleOfRoom:
     """Find the middle of a room and look round there, until it is where it was thought to be."""
 
     def __init__(self, looks: int = 3):
-        self._left, self._last = looks, np.full(3, inf)
+        self._looks_left, self._last = looks, np.full(3, inf)
         self.room_m = 0.0
+        self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the way to the middle as it is known by now."""
         found = ways.middle()
-        if found is None or not self._left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
+        if found is None or not self._looks_left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
             return None
-        (self._last, self.room_m), self._left = found, self._left - 1
+        (self._last, self.room_m), self._looks_left = found, self._looks_left - 1
         way = ways.way_to(self._last)
         return None if way is None else (way, np.full(3, np.nan))
 
@@ -106,7 +116,8 @@ class Frontiers:
 
     def __init__(self, smallest: int = 15, band: float = 0.6):
         self._smallest, self._band = smallest, band
-        self._looked_at: list[NDArray[np.float64]] = []
+        self._looks: list[tuple[NDArray[np.float64], NDArray[np.float64], bool]] = []
+        self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the way to where the nearest frontier is seen from."""
@@ -114,14 +125,24 @@ class Frontiers:
         found = frontiers(
             voxel_map, self._smallest, heights=(height - self._band, height + self._band), start=ways.start, radius=0.2
         )
-        new = [one for one in found if one.look_from is not None and not self._seen(one.centroid)]
-        best = self._nearest(new, ways, NEAR_M) or self._nearest(new, ways, SHORT_M)
-        if best is not None:
-            self._looked_at.append(best[1])
+        if self._looks:  # the last was looked at only where it came to the end of the way
+            place, end, _ = self._looks[-1]
+            self._looks[-1] = place, end, bool(np.linalg.norm((ways.start - end)[:2]) < 2 * ARRIVED)
+        best = self._nearest(found, ways, NEAR_M) or self._nearest(found, ways, SHORT_M)
+        if best is None:
+            self.left = self._why_left(found, ways)
+        else:
+            self._looks.append((best[1], best[0][-1], False))
         return best
 
-    def _seen(self, place: NDArray[np.float64]) -> bool:
-        return any(np.linalg.norm(place - done) < SEEN_AGAIN for done in self._looked_at)
+    def _is_done(self, place: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+        """Return whether a frontier was looked at from about there, or the way there had to be left TRIES times."""
+        same = [
+            looked
+            for at, from_, looked in self._looks
+            if np.linalg.norm(place - at) < SEEN_AGAIN and np.linalg.norm(end - from_) < SEEN_AGAIN
+        ]
+        return any(same) or len(same) >= TRIES
 
     def _nearest(
         self, found: list[Frontier], ways: LevelWays, near: float
@@ -130,9 +151,19 @@ class Frontiers:
         best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         for one in found:
             way = None if one.look_from is None else ways.way_to(one.look_from, near)
-            if way is not None and (best is None or _length(way) < _length(best[0])):
+            if way is None or self._is_done(one.centroid, way[-1]):
+                continue
+            if best is None or _length(way) < _length(best[0]):
                 best = way, one.centroid
         return best
+
+    def _why_left(self, found: list[Frontier], ways: LevelWays) -> dict[str, int]:
+        """Count the frontiers that are left, by why none of them is a goal."""
+        why = [
+            UNSEEN if one.look_from is None else NO_WAY if ways.way_to(one.look_from, SHORT_M) is None else LOOKED_AT
+            for one in found
+        ]
+        return {reason: why.count(reason) for reason in (UNSEEN, NO_WAY, LOOKED_AT)}
 
 
 @dataclass(frozen=True)
@@ -152,6 +183,7 @@ class Explored:
         path: (3,) metres every second, where it flew.
         room_m: Horizontal metres about the place where it ended that touch nothing, `half_height` above and below.
         most_room_m: The most of that there is anywhere in the scene's air at its height.
+        left: How many frontiers are left, by why it does not go there; empty where it did not end by itself.
     """
 
     seed: int
@@ -166,6 +198,7 @@ class Explored:
     path: list[list[float]]
     room_m: float
     most_room_m: float
+    left: dict[str, int]
 
     def as_dict(self) -> dict[str, Any]:
         """Return all values as plain types for JSON."""
@@ -239,7 +272,7 @@ class _Mission:
         coverage.append((now, self._air.known(self._mapper.map)))
         place = self._quad.position
         room_m, most_m = self._air.room(place, self._cruise.half_height)
-        course = (metres, self._goals, least, coverage, place.tolist(), path, room_m, most_m)
+        course = (metres, self._goals, least, coverage, place.tolist(), path, room_m, most_m, self._mission.left)
         return Explored(self._seed, collided, now, done, *course)
 
     def _see(self, now: float) -> None:

@@ -52,6 +52,11 @@ class Straight:
         end = np.asarray(goal) - np.array([self.short, 0, 0])
         return np.stack([self.start, end]) if self.short <= near else None
 
+    def way_apart(self, places, metres):
+        """Return the way back to x = 0, the only place to look round from, unless it is near the places."""
+        far = all(np.linalg.norm(place[:2]) > metres for place in places)
+        return np.stack([self.start, [0, 0, 1]]) if far else None
+
 
 @pytest.fixture
 def one_frontier(monkeypatch):
@@ -66,6 +71,15 @@ def test_what_was_looked_at_is_done(one_frontier):
     assert mission.next(None, Straight(0))[0][-1].tolist() == [5, 0, 1]
     assert mission.next(None, Straight(5)) is None
     assert mission.left == {"seen from nowhere": 0, "no way to it": 0, "looked at already": 1}
+
+
+def test_where_no_frontier_is_left_it_looks_all_round(one_frontier):
+    one_frontier.clear()
+    mission = Frontiers()
+    way, look_at = mission.next(None, Straight(4))  # it has turned at x = 4 m
+    assert way[-1].tolist() == [0, 0, 1]
+    assert np.isnan(look_at).all()
+    assert mission.next(None, Straight(0)) is None  # no second time
 
 
 def test_a_way_that_had_to_be_left_is_tried_again_but_not_for_ever(one_frontier):

@@ -624,6 +624,28 @@ def interrupt_between_steps() -> Iterator[Callable[[], None]]:
         yield check
 
 
+@contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end what runs as Ctrl-C does: the first raises KeyboardInterrupt, which holds its number.
+
+    What cleans up after that is not disturbed by those that follow.
+    """
+    before = {}
+
+    def end(number: int, _: object) -> None:
+        for one in before:
+            signal.signal(one, signal.SIG_IGN)
+        raise KeyboardInterrupt(number)
+
+    try:
+        if threading.current_thread() is threading.main_thread():
+            before.update({one: signal.signal(one, end) for one in _default_signals() if one != signal.SIGINT})
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
 def _default_signals() -> list[int]:
     """Return the signals with default handling: notebooks, servers, nohup and background jobs set their own."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}

@@ -4,8 +4,11 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
+import socket
+import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -292,9 +295,49 @@ def test_two_fleets_do_not_write_one_map(mapped, where):
     with (
         fleet.only_writer_at(Place.of(where)),
         ThreadPoolExecutor(1) as other,
-        pytest.raises(MapFileError, match="another"),
+        pytest.raises(MapFileError, match="another") as refused,
     ):
         other.submit(mapped, [recording(1)], where).result()
+    assert "s3:" not in where or f"process {os.getpid()} on {socket.gethostname()} since 20" in str(refused.value)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_fleet_that_is_told_to_end_gives_the_map_to_the_next(mapped, where, monkeypatch, number):
+    def told(*words):
+        os.kill(os.getpid(), number)
+        time.sleep(5)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fleet, "_boxes", told)
+        with pytest.raises(KeyboardInterrupt) as stopped:
+            mapped([recording(1)], where)
+    assert stopped.value.args == (number,)
+    assert signal.getsignal(number) == signal.SIG_DFL
+    assert_same(mapped([recording(1)], where, resume=True).map.storage.blocks(), alone(recording(1)).storage.blocks())
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(ValueError("bad\nbyte"), r"ValueError: bad\\nbyte"), (MemoryError(), "too little memory")]
+)
+def test_a_recording_whose_reader_fails_is_named_and_left_out(mapped, tmp_path, monkeypatch, error, said):
+    class Failing(recordings.MapRun):
+        def __enter__(self):
+            if self._source == recording(2):
+                raise error
+            return super().__enter__()
+
+    monkeypatch.setattr(recordings, "MapRun", Failing)
+    made = mapped([recording(1), recording(2)], tmp_path / "m.svox")
+    assert made.map.frames == 12
+    assert re.search(said, made.summary()["doubts"][0])
+    assert made.summary()["doubts"][0].startswith(recording(2))
+
+
+def test_more_boxes_than_a_map_may_have_are_told_before_they_are_mapped(mapped, tmp_path, monkeypatch):
+    monkeypatch.setattr(fleet, "MOST_BOXES", 3)
+    monkeypatch.setattr(fleet, "map_box", None)
+    with pytest.raises(StereovoxError, match="larger boxes"):
+        mapped([recording(1)], tmp_path / "m.svox")
 
 
 def test_recordings_of_an_object_store(mapped, s3, tmp_path):
@@ -383,6 +426,18 @@ def test_names_of_recordings(tmp_path):
     (tmp_path / "list.txt").write_text("a b c\n")
     with pytest.raises(StereovoxError, match=r"list\.txt:1: 3 words"):
         recordings_of([f"@{tmp_path / 'list.txt'}"])
+
+
+def test_names_in_a_list_count_from_where_it_is(tmp_path, monkeypatch):
+    (tmp_path / "list.txt").write_text("drives/a ../poses/a.tum\nsim:room\ns3://city/b\n/c\n")
+    names = ["drives/a", "sim:room", "s3://city/b", "/c"]
+    monkeypatch.chdir(tmp_path)
+    assert [one.where for one in recordings_of(["@list.txt"])] == names
+    (tmp_path / "below").mkdir()
+    monkeypatch.chdir(tmp_path / "below")
+    found = recordings_of(["@../list.txt"])
+    assert [one.where for one in found] == ["../drives/a", *names[1:]]
+    assert found[0].poses == "../../poses/a.tum"
 
 
 def test_patterns_leave_out_what_lies_beside_recordings(tmp_path):

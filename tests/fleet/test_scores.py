@@ -3,6 +3,7 @@
 
 import csv
 import json
+from functools import partial
 from pathlib import Path
 
 import made_street
@@ -95,6 +96,26 @@ def test_what_was_scored_is_not_scored_again(sequences, made, scheduler, monkeyp
         sequences[1:], made.out, PROFILES, options=OPTIONS, scheduler=scheduler, resume=True, **SETTINGS
     )
     assert fewer.scored == made.scored[2:]
+
+
+def test_of_several_profiles_only_those_that_failed_are_scored_again(sequences, scheduler, tmp_path, monkeypatch):
+    asked, scored = [], scores._scored
+
+    def failing(where, folder, config, *words):
+        asked.append(config.profile)
+        if asked == ["default"]:
+            raise ValueError("odd")
+        return scored(where, folder, config, *words)
+
+    monkeypatch.setattr(scores, "_scored", failing)
+    run = partial(score_fleet, sequences[:1], tmp_path / "s", PROFILES, options=OPTIONS, scheduler=scheduler)
+    first = run(**SETTINGS)
+    assert [bool(one.error) for one in first.scored] == [True, False]
+    assert "ValueError: odd" in first.scored[0].error
+    again = run(**SETTINGS, resume=True)
+    assert asked == ["default", "valenti2018", "default"]
+    assert [one.profile for one in again.scored] == PROFILES
+    assert not any(one.error for one in again.scored)
 
 
 def test_other_settings_and_other_truths_are_scored_anew(sequences, scheduler, where):

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
@@ -22,6 +24,7 @@ from stereovox.fleet.recordings import (
     boxes_seen,
     frames_of,
     index_recording,
+    local,
     manifest_of,
     recordings_of,
     report_of,
@@ -40,7 +43,7 @@ from stereovox.maps.store import MANIFEST, viewpoint_from
 from stereovox.opening import open_source
 from stereovox.places import Place
 from stereovox.products.merge import together
-from stereovox.run import SURVEYED
+from stereovox.run import SURVEYED, ended_in_order
 from stereovox.safe_io import json_value
 from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
@@ -48,6 +51,8 @@ from stereovox.trust.history import History
 SETTINGS = "fleet.json"
 """The settings that a place's recordings are mapped with, written before anything else."""
 MAX_SETTINGS = 1 << 20
+MOST_BOXES = 250_000
+"""That a manifest can name, with those of the levels and with what all are made of."""
 OVERLAP = 4.0
 """Boxes that a frame shall be in at most, about."""
 Progress = Callable[[int, int, str], object]
@@ -139,10 +144,11 @@ def map_fleet(
         StereovoxError: One line: not one frame could be used, a setting cannot be had in boxes, or the cluster failed.
         MapFileError: Something else is at `out`, another run writes it, or it cannot be written.
         MissingExtra: Dask or obstore is not installed.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; what is done stays.
     """
     started, listed, place = perf_counter(), recordings_of(recordings), Place.of(out)
     check_boxed_target(place, (SETTINGS, f"{RECORDINGS}/", f"{DONE}/"))
-    with only_writer_at(place):
+    with ended_in_order(), only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
         keys = {one: one.key(layout) for one in listed}  # once: files may change meanwhile
         with cluster(scheduler, workers) as run:
@@ -157,6 +163,11 @@ def map_fleet(
                 )
             _check_still_there(place, reports)
             boxes = _boxes(place, layout, [(keys[one], reports[one].frames) for one in used])
+            if len(boxes) > MOST_BOXES:
+                raise StereovoxError(
+                    f"{len(boxes):,} boxes of {layout.side} cells: a map has at most {MOST_BOXES:,}; choose larger "
+                    "boxes (--box-m, at most 512 cells), or make several maps"
+                )
             before = BoxesBefore(place)
             done, mapped = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
@@ -192,12 +203,14 @@ def settings_for(
 
 
 def suggested(recordings: Sequence[Recording], overrides: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return the settings that the first of the recordings suggests that can be opened, and lines about them."""
+    """Return the settings that the first of the recordings suggests that can be opened, and lines about them.
+
+    One in an object store is copied for that.
+    """
     for one in recordings:
-        try:
-            return survey(open_source(one.where), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
-        except StereovoxError:
-            continue  # the next one may do; what is wrong with this one is told later
+        with TemporaryDirectory(prefix="stereovox-") as folder, suppress(StereovoxError, OSError):
+            # what is wrong with one is told later; the next may do
+            return survey(open_source(local(one.where, Path(folder))), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
     return {}, []
 
 

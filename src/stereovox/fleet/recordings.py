@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError, StereovoxError, without_name
+from stereovox.errors import MapFileError, StereovoxError, one_line, without_name
 from stereovox.frame import Cloud, Frame
 from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
@@ -101,7 +101,8 @@ def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
 
     Args:
         names: Recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: in each line a recording, and the
-            file of its corrected poses if there is one; # begins a comment), or `Recording`.
+            file of its corrected poses if there is one, both from where the list is; # begins a comment), or
+            `Recording`.
 
     Returns:
         The recordings; none twice. A pattern leaves out maps, and files of text that are no recordings.
@@ -136,7 +137,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     with TemporaryDirectory(prefix="stereovox-") as folder:
         try:
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
-        except (StereovoxError, OSError) as error:
+        except Exception as error:
             return RecordingReport(recording.where, error=why_not(recording.where, error, Path(folder)), notes=notes)
         manifest = json_value((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
@@ -152,17 +153,21 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     return report
 
 
-def why_not(where: str, error: StereovoxError | OSError, folder: Path) -> str:
-    """Return in one line why a recording cannot be used.
+def why_not(where: str, error: Exception, folder: Path) -> str:
+    """Return in one line why a recording cannot be used, also where what reads it failed in a way nobody foresaw.
 
     Raises the error itself where it is not the recording's: in `folder`, for its copy and its map, is no room.
     """
+    if isinstance(error, MemoryError):
+        return "there is too little memory for it; go on with --resume and fewer --workers"
     if isinstance(error, OSError):
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise error
         return f"{error.filename or where}: {error.strerror or error}; check that you may read it"
     if isinstance(error, MapFileError) and str(folder) in str(error):
         raise error
+    if not isinstance(error, StereovoxError):
+        return one_line(f"it cannot be read ({type(error).__name__}: {error}); is it damaged?")
     return without_name(error, where)
 
 
@@ -383,8 +388,13 @@ def _listed(file: Path) -> list[Recording]:
         if len(words) > 2:
             raise StereovoxError(f"{file}:{number}: {len(words)} words; give a recording, and the file of its poses")
         if words:
-            found.append(Recording(*words))
+            found.append(Recording(*(_beside(file, word) for word in words)))
     return found
+
+
+def _beside(file: Path, name: str) -> str:
+    """Return a name in a list as it is from here: a path counts from where the list is."""
+    return name if is_url(name) or ":" in name.partition("/")[0] else str(file.parent / name)
 
 
 def fingerprint(where: str) -> list[Any]:

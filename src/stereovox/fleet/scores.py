@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,10 +27,10 @@ from stereovox.maps.store import MANIFEST
 from stereovox.opening import open_source
 from stereovox.places import Place
 from stereovox.pose_choice import GIVEN
-from stereovox.run import MapRun
+from stereovox.run import MapRun, ended_in_order
 from stereovox.safe_io import json_value
 
-VERSION = 1
+VERSION = 2
 """Of what is kept of a score; another one is made anew."""
 SCORES, TABLE = "scores.json", "scores.csv"
 MAX_ROW = 1 << 22
@@ -153,6 +153,7 @@ def score_fleet(
             failed.
         MapFileError: Something else is at `out`, or it cannot be written.
         MissingExtra: Dask or obstore is not installed.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; what is done stays.
     """
     options = _checked(options or ScoreOptions())
     listed, place = recordings_of(recordings), Place.of(out)
@@ -165,17 +166,18 @@ def score_fleet(
     if not configs:
         raise StereovoxError("no profile is named; give one or more")
     _check_target(place, resume)
-    with only_writer_at(place):
-        keys = {one: _key(one, configs, options) for one in listed}
-        rows = {one: found for one in listed if (found := _scored_before(place, keys[one])) is not None}
-        tasks = {keys[one]: (place, keys[one], one, configs, options) for one in listed if one not in rows}
-        names = {key: one for one, key in keys.items()}
-        progress(len(rows), len(listed), "recordings")
+    with ended_in_order(), only_writer_at(place):
+        keys = {one: _keys(one, configs, options) for one in listed}
+        rows = {key: row for each in keys.values() for key in each if (row := _scored_before(place, key)) is not None}
+        missing = {one: {key: config for key, config in keys[one].items() if key not in rows} for one in listed}
+        tasks = {next(iter(each)): (place, one, each, options) for one, each in missing.items() if each}
+        before = len(listed) - len(tasks)
+        progress(before, len(listed), "recordings")
         with cluster(scheduler, workers) as run:
-            for key, found in run.results(score_recording, tasks):
-                rows[names[key]] = found
-                progress(len(rows), len(listed), "recordings")
-        scores = FleetScores([row for one in listed for row in rows[one]], str(out))
+            for n, (_, found) in enumerate(run.results(score_recording, tasks), before + 1):
+                rows |= found
+                progress(n, len(listed), "recordings")
+        scores = FleetScores([rows[key] for one in listed for key in keys[one]], str(out))
         if all(row.error for row in scores.scored):
             first = scores.scored[0]
             raise StereovoxError(f"not one recording could be scored ({first.recording}: {first.error})")
@@ -184,12 +186,12 @@ def score_fleet(
 
 
 def score_recording(
-    place: Place, key: str, recording: Recording, configs: Sequence[Config], options: ScoreOptions
-) -> list[RecordingScore]:
-    """Score a recording's maps under several settings, and keep that in a place; a task of a worker."""
-    truths, rows, where = dict[tuple[float, float], TruthCells](), list[RecordingScore](), ""
+    place: Place, recording: Recording, configs: Mapping[str, Config], options: ScoreOptions
+) -> dict[str, RecordingScore]:
+    """Score a recording's maps under settings by their keys, and keep each score in a place; a task of a worker."""
+    truths, rows, where = dict[tuple[float, float], TruthCells](), dict[str, RecordingScore](), ""
     with TemporaryDirectory(prefix="stereovox-") as folder:
-        for number, config in enumerate(configs):
+        for number, (key, config) in enumerate(configs.items()):
             started = perf_counter()
             try:
                 where = where or local(recording.where, Path(folder) / "recording")  # of an object store once
@@ -198,13 +200,13 @@ def score_recording(
                     source: Any = open_source(where)
                     truth, _ = lidar_truth(source, *sizes, options.free, options.frames)
                     truths[sizes] = TruthCells(truth, options.tolerance)
-                rows.append(_scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording))
-            except (StereovoxError, OSError) as error:
+                row = _scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording)
+            except Exception as error:
                 why = why_not(recording.where, error, Path(folder))
-                rows.append(RecordingScore(recording.where, config.profile, error=why))
-            rows[-1] = replace(rows[-1], seconds=perf_counter() - started)
-    if not any(row.error for row in rows):  # what failed is tried again
-        (place / "scores").write(f"{key}.json", json.dumps([asdict(row) for row in rows]).encode())
+                row = RecordingScore(recording.where, config.profile, error=why)
+            rows[key] = replace(row, seconds=perf_counter() - started)
+            if not row.error:  # what failed is tried again
+                (place / "scores").write(f"{key}.json", json.dumps(asdict(rows[key])).encode())
     return rows
 
 
@@ -240,16 +242,16 @@ def _check_target(place: Place, resume: bool) -> None:
         raise MapFileError(f"{place}: there are scores already; go on with them with --resume, or choose another name")
 
 
-def _key(recording: Recording, configs: Sequence[Config], options: ScoreOptions) -> str:
-    """Return a name made of all that the scores depend on."""
-    settings = [config.model_dump(mode="json", exclude={"threads"}) for config in configs]
-    return digest([VERSION, recording.where, fingerprint(recording.where), settings, asdict(options)])
+def _keys(recording: Recording, configs: Sequence[Config], options: ScoreOptions) -> dict[str, Config]:
+    """Return the settings by names made of all that the scores under them depend on."""
+    of = [VERSION, recording.where, fingerprint(recording.where), asdict(options)]
+    return {digest([*of, config.model_dump(mode="json", exclude={"threads"})]): config for config in configs}
 
 
-def _scored_before(place: Place, key: str) -> list[RecordingScore] | None:
+def _scored_before(place: Place, key: str) -> RecordingScore | None:
     saved = (place / "scores").find(f"{key}.json", MAX_ROW)
     try:
-        return None if saved is None else [RecordingScore(**row) for row in json_value(saved)]
+        return None if saved is None else RecordingScore(**json_value(saved))
     except (TypeError, ValueError):
         return None  # damaged: it is scored again
 

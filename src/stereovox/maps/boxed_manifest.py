@@ -11,12 +11,15 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from os import getpid
+from socket import gethostname
 from typing import Any
 
 import numpy as np
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, one_line
 from stereovox.frame import Viewpoint
 from stereovox.maps.boxes import BOXES, BoxEntry, BoxLayout
 from stereovox.maps.lock import only_writer_in
@@ -32,7 +35,8 @@ MAX_MANIFEST = 1 << 27
 """Bytes of a manifest; a box takes about 300."""
 MAX_LEVELS = 24
 LOCK = ".writer"
-"""The object that stands for the right to write to a place in a store."""
+"""The object that stands for the right to write to a place in a store, and names who has it."""
+MAX_HOLDER = 1000
 
 
 @dataclass
@@ -133,16 +137,19 @@ def sweep_boxes(place: Place, keep: Iterable[str] = ()) -> None:
 def only_writer_at(place: Place) -> Iterator[None]:
     """Hold the right to write to a place. Raises MapFileError where another run has it.
 
-    A folder's is lifted by the system however its holder ends. A store knows no such thing: what a killed run leaves
-    there must be removed by hand, as the error says.
+    A folder's is lifted by the system however its holder ends. A store knows no such thing: what a run leaves there
+    that `kill -9` ended must be removed by hand, as the error says, which names that run.
     """
     if isinstance(place, Folder):
         with only_writer_in(place.path):
             yield
         return
-    if not place.create(LOCK, b"stereovox"):
+    since = datetime.now(UTC).isoformat(" ", "seconds")
+    if not place.create(LOCK, f"process {getpid()} on {gethostname()} since {since}".encode()):
+        holder = one_line((place.find(LOCK, MAX_HOLDER) or b"it has just ended").decode(errors="replace"))
         raise MapFileError(
-            f"{place}: is being written by another run; wait for its end, or remove {place}/{LOCK} if it was killed"
+            f"{place}: is being written by another run ({holder}); wait for its end, or remove {place}/{LOCK} if it "
+            "was killed"
         )
     try:
         yield

@@ -2,15 +2,17 @@
 """A second recording is found in the first one's world, or it is said why it cannot be."""
 
 from copy import deepcopy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from made_loops import ELSEWHERE, RACKS, RING, closed, truths
 
 from stereovox.errors import StereovoxError
+from stereovox.loops import placing
 from stereovox.loops.closer import difference
 from stereovox.loops.placing import placed
-from stereovox.se3 import inverse
+from stereovox.se3 import from_quaternion, inverse
 
 SECOND = RING.replace("seed=3", "seed=8")
 
@@ -35,6 +37,30 @@ def test_a_second_recording_is_found_and_joined():
                 apart.append(np.linalg.norm(difference(real, inverse(where[i]) @ where[k])[3:]))
     assert len(apart) > 4
     assert np.median(apart) < 0.06
+
+
+@pytest.mark.parametrize(("side", "parts"), [(40.0, 1), (7.0, 6)])
+def test_places_are_found_in_the_whole_and_in_parts(monkeypatch, side, parts):
+    first, second = closed(RING, 0, 200), closed(SECOND, 60, 180, elsewhere=True)
+    numbers, steps = list(range(0, len(second.submaps), 6)), list[tuple[int, int]]()
+    monkeypatch.setattr(placing, "AREA_M", side)
+    found = placing._places(first, second, numbers, lambda *done: steps.append(done))
+    assert steps[-1] == (parts * len(numbers),) * 2
+    for number in numbers:
+        off = [difference(inverse(ELSEWHERE) @ second.submaps[number].T_map_anchor, T) for T in found[number]]
+        assert len(off) == placing.PEAKS
+        assert any(np.linalg.norm(one[3:]) < 1 and np.linalg.norm(one[:3]) < 0.25 for one in off)
+
+
+def test_only_parts_are_searched_that_a_camera_was_near():
+    corner = [[x, 0.0] for x in np.arange(0.0, 400.0, 5.0)] + [[400.0, y] for y in np.arange(0.0, 300.0, 5.0)]
+    poses = [from_quaternion([*place, 1.0], [0, 0, 0, 1]) for place in corner]
+    way = SimpleNamespace(submaps=[SimpleNamespace(T_map_anchor=T) for T in poses], R_level_map=np.eye(3))
+    areas = placing._areas(way)
+    for place in np.array(corner) + np.random.default_rng(5).uniform(-2, 2, (len(corner), 2)):
+        assert any((np.abs(place - middle) <= half + 1e-9).all() for middle, half in areas)
+    assert len(areas) <= 22  # of 88 that the square has
+    assert max(half.max() for _, half in areas) <= placing.AREA_M / 2
 
 
 def test_what_was_never_seen_is_not_found():

@@ -2,8 +2,8 @@
 """Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
 
 RECORDING is what `map` takes, a pattern ('drives/*'), a list (@drives.txt: a recording in each line, and the file of
-its corrected poses if there is one) or an s3:// prefix. The map does not depend on workers or boxes. What is done
-stays: --resume does what is missing, and what other recordings or poses change.
+its corrected poses if there is one, from where the list is) or an s3:// prefix. The map does not depend on workers or
+boxes. What is done stays: --resume does what is missing, and what other recordings or poses change.
 """
 
 from __future__ import annotations

@@ -12,14 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.drift import difference
 from stereovox.loops.matching import matched
-from stereovox.loops.search import Search
-from stereovox.loops.submaps import Shape
+from stereovox.loops.search import Peak, Search, apart
 from stereovox.se3 import Transform, inverse
+from stereovox.track.views import View
 
 SOUGHT = 12
 """Submaps of the second recording that are sought, spread evenly over it."""
@@ -27,8 +28,8 @@ UP_M = 1.5
 """Metres by which the heights of two worlds may differ."""
 BEYOND_M = 3.0
 """Metres by which the second camera may be outside of where the first one was."""
-CELL_M = 0.4
-"""Cells in which a place is sought in a whole map."""
+CELL_M, AREA_M = 0.4, 40.0
+"""Cells in which a place is sought in a whole map, and the largest side of the parts in which that is searched."""
 PEAKS = 8
 """Places that are looked at closely for each."""
 NEAREST = 3
@@ -70,18 +71,15 @@ def placed(
     Args:
         first: All of the first recording.
         second: All of the second.
-        progress: Called with how many submaps were sought, and their number.
+        progress: Called with how many searches were done, and their number.
 
     Raises:
         StereovoxError: Too little fits, or it fits elsewhere as well.
     """
     numbers = sorted({round(i) for i in np.linspace(0, len(second.submaps) - 1, SOUGHT)})
-    search, votes = _whole(first), list[_Vote]()
-    for done, number in enumerate(numbers, 1):
-        shape = second.shapes[second.submaps[number]]
-        if shape is not None:
-            votes += _votes(first, second, number, shape, search)
-        progress(done, len(numbers))
+    votes = list[_Vote]()
+    for number, places in _places(first, second, numbers, progress).items():
+        votes += _votes(first, second, number, places)
     groups = sorted((_agreeing(vote, votes, second) for vote in votes), key=_submaps, reverse=True)
     if not groups or _submaps(groups[0]) < LEAST:
         found = _submaps(groups[0]) if groups else 0
@@ -101,25 +99,13 @@ def placed(
     return Placed(best[-1].T_first_second, list(pairs.values()))
 
 
-def _whole(closer: LoopCloser) -> Search:
-    """Return the search in all that a recording shows."""
-    points, views = [], []
-    for submap in closer.submaps:
-        shape, T = closer.shapes[submap], submap.T_map_anchor
-        if shape is not None:
-            points.append(shape.points @ T[:3, :3].T + T[:3, 3])
-            views.append(shape.views[len(shape.views) // 2]._replace(T=T @ shape.views[len(shape.views) // 2].T))
-    if not points:
-        raise StereovoxError("the first map shows no surfaces")
-    return Search(np.concatenate(points), views, closer.R_level_map, CELL_M)
-
-
-def _votes(first: LoopCloser, second: LoopCloser, number: int, shape: Shape, search: Search) -> list[_Vote]:
-    """Return what a submap of the second recording says of how the worlds lie."""
+def _votes(first: LoopCloser, second: LoopCloser, number: int, places: Sequence[Transform]) -> list[_Vote]:
+    """Return what a submap of the second recording says of how the worlds lie, by where it may be in the first's."""
     submap, votes = second.submaps[number], list[_Vote]()
-    for T in _places(first, second, number, shape, search):
-        centre = T[:3, :3] @ submap.centre + T[:3, 3]
-        away = np.linalg.norm(np.array([one.middle for one in first.submaps]) - centre, axis=1)
+    shape, middles = second.shapes[submap], np.array([one.middle for one in first.submaps])
+    assert shape is not None
+    for T in places:
+        away = np.linalg.norm(middles - (T[:3, :3] @ submap.centre + T[:3, 3]), axis=1)
         for i in np.argsort(away)[:NEAREST]:
             earlier, T_map_first = first.shapes[first.submaps[i]], first.submaps[i].T_map_anchor
             if earlier is None or len(first.repeats.shifts([first.submaps[i].middle])):
@@ -131,17 +117,70 @@ def _votes(first: LoopCloser, second: LoopCloser, number: int, shape: Shape, sea
     return votes
 
 
-def _places(first: LoopCloser, second: LoopCloser, number: int, shape: Shape, search: Search) -> list[Transform]:
-    """Return where a submap of the second recording may lie in the first one's world (4, 4)."""
-    submap, R_first_second = second.submaps[number], first.R_level_map.T @ second.R_level_map
-    level = first.R_level_map @ np.array([one.T_map_anchor[:3, 3] for one in first.submaps]).T
-    low, high = level.min(axis=1), level.max(axis=1)
-    here = second.R_level_map @ submap.T_map_anchor[:3, 3]
-    guess = np.eye(4)
-    guess[:3, :3] = R_first_second @ submap.T_map_anchor[:3, :3]
-    guess[:3, 3] = first.R_level_map.T @ [*(low + high)[:2] / 2, here[2]]
-    reach = np.array([*(high - low)[:2] / 2 + BEYOND_M, UP_M])
-    return search.places(shape, guess, reach, np.pi, PEAKS)
+def _places(
+    first: LoopCloser, second: LoopCloser, numbers: Sequence[int], progress: Callable[[int, int], object]
+) -> dict[int, list[Transform]]:
+    """Return where each of these submaps of the second recording may lie in the first one's world (4, 4).
+
+    The first recording is searched part by part, so that the time grows with its way and no more, and memory does not.
+    """
+    shapes = {number: shape for number in numbers if (shape := second.shapes[second.submaps[number]]) is not None}
+    beyond = max((float(np.linalg.norm(shape.points, axis=1).max()) for shape in shapes.values()), default=0.0)
+    shown, areas = _Shown(first), _areas(first)
+    peaks: dict[int, list[Peak]] = {number: [] for number in shapes}
+    for done, (middle, half) in enumerate(areas):
+        search = shown.search(middle, half + beyond)
+        for n, (number, shape) in enumerate(shapes.items(), 1):
+            T = second.submaps[number].T_map_anchor
+            guess = np.eye(4)
+            guess[:3, :3] = first.R_level_map.T @ second.R_level_map @ T[:3, :3]
+            guess[:3, 3] = first.R_level_map.T @ [*middle, (second.R_level_map @ T[:3, 3])[2]]
+            if search is not None:
+                peaks[number] += search.peaks(shape, guess, np.array([*half, UP_M]), np.pi, PEAKS)
+            progress(done * len(shapes) + n, len(areas) * len(shapes))
+    T_map_level = np.eye(4)
+    T_map_level[:3, :3] = first.R_level_map.T
+    return {n: [T_map_level @ peak.T_level_later for peak in apart(found, PEAKS)] for n, found in peaks.items()}
+
+
+def _areas(closer: LoopCloser) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the parts of where a camera may be that was near a recording's: middles and half sizes (2,), levelled."""
+    level = np.array([one.T_map_anchor[:3, 3] for one in closer.submaps]) @ closer.R_level_map.T[:, :2]
+    low, high = level.min(axis=0) - BEYOND_M, level.max(axis=0) + BEYOND_M
+    count = np.ceil((high - low) / AREA_M).astype(int)
+    half = (high - low) / count / 2
+    middles = (low + half * (2 * np.array(place) + 1) for place in np.ndindex(*count))
+    return [(middle, half) for middle in middles if (np.abs(level - middle) <= half + BEYOND_M).all(axis=1).any()]
+
+
+class _Shown:
+    """What a recording shows, levelled."""
+
+    def __init__(self, closer: LoopCloser):
+        self._R_level_map = closer.R_level_map
+        points, self._views = [], list[View]()
+        for submap in closer.submaps:
+            shape, T = closer.shapes[submap], submap.T_map_anchor
+            if shape is not None:
+                points.append((shape.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+                view = shape.views[len(shape.views) // 2]
+                self._views.append(view._replace(T=T @ view.T))
+        if not points:
+            raise StereovoxError("the first map shows no surfaces")
+        self._points = np.concatenate(points)
+
+    def search(self, middle: NDArray[np.float64], half: NDArray[np.float64]) -> Search | None:
+        """Return the search in a part of it, by its middle (2,) and half size (2,); None where it shows nothing."""
+        near = (np.abs(self._points @ self._R_level_map.T[:, :2] - middle) <= half).all(axis=1)
+        return Search(self._points[near], self._seeing(middle, half), self._R_level_map, CELL_M) if near.any() else None
+
+    def _seeing(self, middle: NDArray[np.float64], half: NDArray[np.float64]) -> list[View]:
+        """Return the views that reach into a part."""
+        at = np.array([view.T[:3, 3] for view in self._views]) @ self._R_level_map.T[:, :2]
+        away = np.linalg.norm(np.maximum(np.abs(at - middle) - half, 0), axis=1)
+        deepest = np.array([view.nearest[np.isfinite(view.nearest)].max(initial=0) for view in self._views])
+        far = deepest * np.sqrt(1 + np.array([view.slope @ view.slope for view in self._views]))
+        return [view for view, reaches in zip(self._views, away <= far, strict=True) if reaches]
 
 
 def _agreeing(vote: _Vote, votes: Sequence[_Vote], second: LoopCloser) -> list[_Vote]:

@@ -60,19 +60,25 @@ class Search:
     def places(
         self, later: Shape, guess: Transform, reach: NDArray[np.float64], turn: float, most: int = PEAKS
     ) -> list[Transform]:
-        """Return the likeliest poses T_earlier_later (4, 4), best first.
+        """Return the likeliest poses T_earlier_later (4, 4), best first; arguments as of `peaks`."""
+        return [
+            inverse(self._T) @ peak.T_level_later for peak in apart(self.peaks(later, guess, reach, turn, most), most)
+        ]
+
+    def peaks(self, later: Shape, guess: Transform, reach: NDArray[np.float64], turn: float, most: int) -> list[Peak]:
+        """Return the likeliest places of each heading.
 
         Args:
             later: A submap.
-            guess: (4, 4) where the search begins.
+            guess: (4, 4) T_earlier_later where the search begins.
             reach: (3,) metres to each side of it that are searched: across and up.
             turn: Radians by which its heading may be off.
-            most: Largest number of poses.
+            most: Largest number of places of a heading.
         """
         seeds = later.points[:: max(1, len(later.points) // SEEDS)]
         steps = int(np.ceil(turn / self._turn))
         window = 2 * np.ceil(reach / self._cell).astype(int) + 1
-        rows, peaks = np.ascontiguousarray(self._grid.transpose(0, 2, 1)), list[_Peak]()
+        rows, peaks = np.ascontiguousarray(self._grid.transpose(0, 2, 1)), list[Peak]()
         found = np.empty(window[[0, 2, 1]], np.int32)
         for angle in self._turn * np.arange(-steps, steps + 1):
             T = self._T @ guess
@@ -82,8 +88,8 @@ class Search:
             by_axis = np.ascontiguousarray(found.transpose(0, 2, 1))
             for place, score in self._highest(by_axis, LEAST * ON * len(seeds), most):
                 shift = self._cell * (np.array(place) - window // 2)
-                peaks.append(_Peak(score, angle, T[:3, 3] + shift, T[:3, :3]))
-        return [inverse(self._T) @ peak.pose for peak in _apart(peaks, most)]
+                peaks.append(Peak(score, angle, T[:3, 3] + shift, T[:3, :3]))
+        return peaks
 
     def _highest(self, found: NDArray[np.int32], least: float, most: int) -> list[tuple[tuple[int, ...], int]]:
         """Return where the highest scores are, and these, none in the neighbourhood of another; `found` is used up."""
@@ -133,22 +139,32 @@ class Search:
 
 
 @dataclass(frozen=True, eq=False)
-class _Peak:
+class Peak:
+    """A place where a submap may lie on what a search knows, in its axes turned so that z points up.
+
+    Attributes:
+        score: How well it fits there.
+        angle: Radians by which its heading is turned from the guess.
+        place: (3,) metres.
+        R: (3, 3) its rotation.
+    """
+
     score: int
     angle: float
     place: NDArray[np.float64]
     R: NDArray[np.float64]
 
     @property
-    def pose(self) -> Transform:
+    def T_level_later(self) -> Transform:  # noqa: N802
+        """Its pose (4, 4)."""
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = self.R, self.place
         return T
 
 
-def _apart(peaks: Sequence[_Peak], most: int) -> list[_Peak]:
+def apart(peaks: Sequence[Peak], most: int) -> list[Peak]:
     """Return at most so many peaks from high to low, without those near a higher one."""
-    kept = list[_Peak]()
+    kept = list[Peak]()
     for peak in sorted(peaks, key=lambda peak: -peak.score):
         if not any(_is_same(peak, other) for other in kept):
             kept.append(peak)
@@ -157,6 +173,6 @@ def _apart(peaks: Sequence[_Peak], most: int) -> list[_Peak]:
     return kept
 
 
-def _is_same(one: _Peak, other: _Peak) -> bool:
+def _is_same(one: Peak, other: Peak) -> bool:
     turned = abs((one.angle - other.angle + np.pi) % (2 * np.pi) - np.pi)
     return bool(turned < SAME_RAD and np.abs(one.place - other.place).max() < SAME_M)

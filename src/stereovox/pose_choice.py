@@ -11,7 +11,7 @@ import numpy as np
 from stereovox import opening
 from stereovox.errors import NoPoses, StereovoxError, did_you_mean
 from stereovox.sources.base import Stream
-from stereovox.track.stream import POSE_FAULTS
+from stereovox.track.tracker import POSE_FAULTS
 
 GIVEN, TRACK, BOTH = "given", "track", "both"
 CHOICES = (GIVEN, TRACK, BOTH)

@@ -43,6 +43,7 @@ from stereovox.safe_io import check_in_space
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
 from stereovox.survey import LEVELLED, TILTED, level_start, survey
+from stereovox.threads import expecting
 from stereovox.track.guided import GuidedTracker
 from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
@@ -480,27 +481,6 @@ def add_all(
             stopped(len(reports))
         raise
     return reports
-
-
-def expecting(expect: Callable[[SeenT], None], frames: Iterable[SeenT]) -> Iterator[SeenT]:
-    """Yield the frames, each once `expect` was called with the one after it.
-
-    What the source raises is raised after its last frame, as without this.
-    """
-    coming = iter(frames)
-    frame, failure = next(coming, None), None
-    while frame is not None:
-        following = None
-        try:
-            following = next(coming, None)
-        except Exception as error:
-            failure = error
-        if following is not None:
-            expect(following)
-        yield frame
-        if failure is not None:
-            raise failure
-        frame = following
 
 
 def frames_offered(mapper: AnyMapper[Any]) -> int:

@@ -7,7 +7,7 @@ import os
 import threading
 from _thread import RLock
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
@@ -89,6 +89,27 @@ class Ahead(Generic[First, Second]):
     def _call(self, argument: First) -> Second:
         with self._alone:
             return self._function(argument)
+
+
+def expecting(expect: Callable[[First], None], frames: Iterable[First]) -> Iterator[First]:
+    """Yield frames, each once `expect` was called with the one after it.
+
+    What the source raises is raised after its last frame, as without this.
+    """
+    coming = iter(frames)
+    frame, failure = next(coming, None), None
+    while frame is not None:
+        following = None
+        try:
+            following = next(coming, None)
+        except Exception as error:
+            failure = error
+        if following is not None:
+            expect(following)
+        yield frame
+        if failure is not None:
+            raise failure
+        frame = following
 
 
 class Scratch(Generic[T]):

@@ -29,6 +29,7 @@ from stereovox.sources.camera_file import with_camera
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import TRAJECTORY_ENDINGS, write_trajectory
 from stereovox.survey import level_start, survey
+from stereovox.threads import expecting
 from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
 from stereovox.track.stream import LOST, follow
@@ -184,7 +185,9 @@ def track_recording(
     tracker = Tracker(config, start=level_start(stream, config), imu=imu)
     try:
         with interrupt_between_steps() as check:
-            for frame, tracked in follow(run.noting(stream), tracker):
+            noted = run.noting(stream)
+            images = noted if stream.length is None else expecting(tracker.expect, noted)
+            for frame, tracked in follow(images, tracker):
                 run.add(frame, tracked)
                 progress(run.spans.frames, stream.length or 0, DOING)
                 check()

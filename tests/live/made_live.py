@@ -27,15 +27,17 @@ def wall(distance_m, camera=CAMERA, seed=0):
 
 
 class Images(Stream):
-    """`count` images of a wall, every `period_s`, stamped when they are taken, without poses."""
+    """`count` images of a wall, every `period_s`, stamped when they are taken, without poses, from an event on."""
 
-    def __init__(self, name="camera", count=10, period_s=0.02, offset_ns=0, distance_m=2.0, failure=None):
+    def __init__(self, name="camera", count=10, period_s=0.02, offset_ns=0, distance_m=2.0, failure=None, begins=None):
         self.name, self.camera, self.notes, self.posed = name, CAMERA, (), False
         self.count, self.period_s, self.offset_ns, self.distance_m = count, period_s, offset_ns, distance_m
-        self.failure, self.closed, self.stamps = failure, False, []
+        self.failure, self.closed, self.stamps, self.begins = failure, False, [], begins
 
     def __iter__(self):
         try:
+            if self.begins is not None:
+                self.begins.wait(60)
             begin = monotonic()
             for k in range(self.count):
                 sleep(max(0.0, begin + k * self.period_s - monotonic()))

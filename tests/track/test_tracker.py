@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from threading import current_thread
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, box, cylinder
 from stereovox.track.fit import Fit, Limits
-from stereovox.track.tracker import FOLLOWING, FOUND, RETURNING, _doubt, _open
+from stereovox.track.surfaces import Surfaces
+from stereovox.track.tracker import FOLLOWING, FOUND, POSE_FAULTS, RETURNING, _doubt, _open
 
 METRES, DEGREES = 0.02, 0.5
 """Bounds of the errors of 25 images."""
@@ -66,6 +68,33 @@ def test_the_same_frames_give_the_same_poses_and_the_poses_they_bring_are_not_us
         assert np.array_equal(first.T_world_sensor, other.T_world_sensor)
         assert np.array_equal(first.covariance, other.covariance)
         assert first.lost == other.lost
+
+
+def test_what_is_expected_is_seen_in_the_background_and_poses_are_the_same(monkeypatch):
+    taken, by, threads = frames("room")[:12], tracker(frames("room")[0].T_world_sensor), []
+    see = Surfaces.see
+
+    def noted(self, frame):
+        threads.append(current_thread())
+        return see(self, frame)
+
+    monkeypatch.setattr(Surfaces, "see", noted)
+    for frame, ahead, first in zip(taken, [*taken[1:], taken[0]], track(taken).found, strict=True):
+        by.expect(ahead)
+        by.expect(replace(ahead, sensor="another"))
+        other = by.add(frame)
+        assert np.array_equal(first.T_world_sensor, other.T_world_sensor)
+        assert np.array_equal(first.covariance, other.covariance)
+        assert first.lost == other.lost
+    elsewhere = sum(thread is not current_thread() for thread in threads[12:])
+    assert elsewhere >= 10  # all but the first two; none before there was a frame
+    assert len(threads) - 12 in (12, 13)  # each once, and the one that never came
+
+
+@pytest.mark.parametrize("fault", sorted(POSE_FAULTS))
+def test_what_is_wrong_with_a_pose_does_not_matter_for_an_image(fault):
+    taken = [replace(frame, fault=fault, fault_detail="no pose near") for frame in frames("room")[:3]]
+    assert track(taken).lost == [0]
 
 
 def test_without_a_start_the_first_camera_looks_along_x_and_level():

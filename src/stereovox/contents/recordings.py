@@ -18,7 +18,7 @@ from stereovox.sources.bags.recording import file_part
 from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
 from stereovox.survey import LEVEL_ENOUGH, TILTED, Survey, Up, survey
-from stereovox.track.stream import POSE_FAULTS
+from stereovox.track.tracker import POSE_FAULTS
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""

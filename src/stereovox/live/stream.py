@@ -7,7 +7,7 @@ A thread for each camera puts its images into queues; an image leaves them once 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,8 +33,8 @@ from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.sources.waiting import Arrival, Waiting
 from stereovox.sources.wall_clock import epoch_ns
 from stereovox.survey import level_pose
-from stereovox.track.stream import POSE_FAULTS, follow
-from stereovox.track.tracker import Tracked, Tracker
+from stereovox.track.stream import follow
+from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
 
 WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 2
 """Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer
@@ -316,9 +316,9 @@ class LiveStream(Stream):
         """Yield a camera's images with tracked poses, which become those of the body."""
         poses = self.poses
         assert poses is not None
-        feed.latest = Latest(self._noted(feed), UNTRACKED)
-        T_camera_body = inverse(feed.camera.T_body_camera)
         tracker = _LateTracker(self.config, feed.stream)
+        feed.latest = Latest(_announced(self._noted(feed), tracker.expect), UNTRACKED)
+        T_camera_body = inverse(feed.camera.T_body_camera)
         for image, tracked in follow(feed.latest, tracker):
             T = np.full((4, 4), np.nan) if tracked.lost else tracked.T_world_sensor @ T_camera_body
             if not tracked.lost or poses.added:
@@ -370,10 +370,22 @@ class _LateTracker:
             self._tracker = Tracker(self._config, start=start, imu=imu_of(self._stream))
         return self._tracker.add(frame)
 
+    def expect(self, frame: AnyFrame, /) -> None:
+        """Begin with what can be done of a frame, as `Tracker.expect`."""
+        if self._tracker is not None:
+            self._tracker.expect(frame)
+
     @property
     def imu_use(self) -> str:
         """What was made of the IMU."""
         return self._tracker.imu_use if self._tracker else ""
+
+
+def _announced(images: Iterable[AnyFrame], expect: Callable[[AnyFrame], None]) -> Iterator[AnyFrame]:
+    """Yield images, each once `expect` was called with it: in the thread of the camera, before its turn comes."""
+    for image in images:
+        expect(image)
+        yield image
 
 
 def _feed(camera: LiveCamera) -> _Feed:

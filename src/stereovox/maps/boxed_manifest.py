@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from os import getpid
 from socket import gethostname
 from typing import Any
@@ -144,8 +143,7 @@ def only_writer_at(place: Place) -> Iterator[None]:
         with only_writer_in(place.path):
             yield
         return
-    since = datetime.now(UTC).isoformat(" ", "seconds")
-    if not place.create(LOCK, f"process {getpid()} on {gethostname()} since {since}".encode()):
+    if not place.create(LOCK, f"process {getpid()} on {gethostname()}".encode()):
         holder = one_line((place.find(LOCK, MAX_HOLDER) or b"it has just ended").decode(errors="replace"))
         raise MapFileError(
             f"{place}: is being written by another run ({holder}); wait for its end, or remove {place}/{LOCK} if it "

@@ -58,6 +58,10 @@ class GuidedTracker:
             return replace(tracked, lost=NO_START)
         return tracked.moved(self._T_world_tracker)
 
+    def expect(self, frame: AnyFrame) -> None:
+        """Begin with what can be done of the next frame, as `Tracker.expect`."""
+        self._tracker.expect(frame)
+
     def picture_use(self) -> str:
         """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
         return self._tracker.picture_use()

@@ -14,12 +14,11 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
 from stereovox.sources.base import Stream
+from stereovox.threads import expecting
 from stereovox.track.fit import LOST, deviations
-from stereovox.track.tracker import Tracked
+from stereovox.track.tracker import POSE_FAULTS, Tracked
 
 CURE = "move slower, or back to what was seen before"
-POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
-"""Faults of a frame's own pose, which is not used here."""
 
 
 class AnyTracker(Protocol):
@@ -27,6 +26,10 @@ class AnyTracker(Protocol):
 
     def add(self, frame: AnyFrame, /) -> Tracked:
         """Return the pose of a frame."""
+        ...
+
+    def expect(self, frame: AnyFrame, /) -> None:
+        """Begin with what can be done of a frame before those that come first have been added."""
         ...
 
 
@@ -74,7 +77,9 @@ class TrackedStream(Stream):
         return TrackedStream(self._source, self._make, self._how, self._skip + count)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        with closing(follow(self._source, self._make())) as found:
+        tracker = self._make()
+        frames = self._source if self.length is None else expecting(tracker.expect, self._source)
+        with closing(follow(frames, tracker)) as found:
             yield from (frame for frame, _ in islice(found, self._skip, None))
 
 
@@ -122,7 +127,7 @@ def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
 def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
     if _is_faulty(frame):
         return Tracked(np.full((4, 4), np.nan), np.full((6, 6), np.inf), frame.fault_detail or str(frame.fault))
-    return tracker.add(replace(frame, fault=None, fault_detail=""))
+    return tracker.add(frame)
 
 
 def _begun(frame: AnyFrame, tracked: Tracked, why: str) -> tuple[AnyFrame, Tracked]:

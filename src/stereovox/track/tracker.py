@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -25,6 +26,7 @@ from stereovox.se3 import (
     rotation_vector,
 )
 from stereovox.sources.imu import Imu
+from stereovox.threads import Ahead
 from stereovox.track.fit import RIGID, Fit, Limits, deviations
 from stereovox.track.inertial import Gyroscope, Turn, up_by_force
 from stereovox.track.surfaces import Surfaces
@@ -33,6 +35,8 @@ from stereovox.trust.validate import matrix_of
 
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
+POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
+"""Faults of a frame's own pose, which is not used here."""
 GIVEN, GIVEN_SHARE = np.repeat([np.radians(0.2), 0.005], 3), 0.05
 """Standard deviations of a given motion: radians and metres, and share of it."""
 GAP, LONGEST = 2.0, 10.0
@@ -179,6 +183,7 @@ class Tracker:
         self._given_start, self._felt_up = self._start, False
         self._imu, self._gyroscope = imu, None if imu is None else Gyroscope(imu)
         self._evidence: Evidence[Any] | None = None
+        self._see: Ahead[AnyFrame, Any] | None = None
         self._sensor = ""
         self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
         self._stamps: list[int] = []  # of the last images that were followed
@@ -217,12 +222,13 @@ class Tracker:
             motion = matrix_of(motion)
             if not rigidity_error(motion) < RIGID:
                 raise StereovoxError("motion is no rigid motion; give a (4, 4) T_before_now in metres, or None")
-        if self._evidence is None:
+        if self._evidence is None or self._see is None:
             self._evidence, self._sensor = _evidence_for(frame, self.config), frame.sensor
+            self._see = Ahead(partial(_seen, self._evidence))  # without `self`, which would keep itself alive
         if frame.sensor != self._sensor:
             return self._lost(f"the camera {self._sensor or 'of the first frame'} is tracked, not {frame.sensor}")
         try:
-            seen = self._evidence.see(frame)
+            seen = self._see(frame)
         except FrameRefused as refused:
             return self._lose(str(refused))
         if self._learned < 2 and self._trial != 0:
@@ -232,6 +238,17 @@ class Tracker:
         if motion is not None and not self._trial:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
+
+    def expect(self, frame: AnyFrame) -> None:
+        """Begin with what can be done of a frame that `add` will get, in the background, while it has another one.
+
+        Poses are the same without. Nothing happens before the first frame is added.
+
+        Args:
+            frame: The very object that `add` will get. It must not change meanwhile.
+        """
+        if self._see is not None and frame.sensor == self._sensor:
+            self._see.begin(frame)
 
     def picture_use(self) -> str:
         """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
@@ -432,6 +449,11 @@ def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
 
         return Pairs(frame.pair)
     return Surfaces(config)
+
+
+def _seen(evidence: Evidence[Seen], frame: AnyFrame) -> Seen:
+    """Return what of a frame is used, whatever is wrong with its own pose."""
+    return evidence.see(replace(frame, fault=None, fault_detail="") if frame.fault in POSE_FAULTS else frame)
 
 
 def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand) -> tuple[Fit, str]:

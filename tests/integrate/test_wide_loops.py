@@ -5,7 +5,7 @@ A loop that looks something up between its products is compiled one lane at a ti
 """
 
 import pytest
-from machine_code import NEOVERSE_N1, SKYLAKE_512, ZEN_3, alone, arithmetic, listings, loops
+from machine_code import NEOVERSE_N1, SKYLAKE_512, ZEN_3, arithmetic, listings_alone, loops
 
 LANES = {ZEN_3: 8, SKYLAKE_512: 16, NEOVERSE_N1: 4}
 RAYS = ["stereovox.integrate._ray:cast", "stereovox.integrate._ray:draw"]
@@ -32,7 +32,7 @@ PRODUCTS_IN_STEP = 3
 @pytest.fixture(scope="module")
 def made():
     kernels = [*RAYS, EVALUATE, WEIGH, SCATTER, DENOISE]
-    return dict(zip(LANES, listings(alone(ONE_IMAGE, kernels), kernels, LANES), strict=True))
+    return dict(zip(LANES, listings_alone(ONE_IMAGE, kernels, LANES), strict=True))
 
 
 @pytest.mark.parametrize("kernel", RAYS)

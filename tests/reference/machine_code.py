@@ -2,7 +2,7 @@
 """Machine code of kernels for processors other than this one, AArch64 among them: compiled and read, never run.
 
 `listings` runs a program in a process of its own and returns what the kernels it compiled become on other processors;
-`alone` makes of a program that calls kernels one that compiles just those of interest, most of the time saved.
+`listings_alone` compiles just those of interest, and not for this processor: most of the time saved.
 What numba hands to LLVM hardly depends on the processor; so it is kept as it is there, and numba's own optimisation
 is repeated with another target. `loops` finds the innermost loops of a listing, `arithmetic` counts what one divides
 and multiplies, many numbers at once or one by one.
@@ -16,11 +16,12 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
-from numba.core import codegen, config
+from numba.core import cgutils, codegen, config
 from numba.core.compiler_lock import global_compiler_lock
 
 
@@ -53,8 +54,8 @@ print(json.dumps("\\n".join(lines)))
 CHILD = """
 import json, os, sys
 import machine_code
-machine_code.record()
 job = json.loads(sys.argv[1])
+machine_code.record(job["runs"])
 from stereovox import _jit
 _jit.cache_folder = lambda: None  # what comes from the disk cache is optimised already
 exec(job["program"])
@@ -65,20 +66,23 @@ print(json.dumps([
 """
 
 
-def listings(program: str, kernels: list[str], processors: Iterable[Processor]) -> list[dict[str, str]]:
+def listings(
+    program: str, kernels: list[str], processors: Iterable[Processor], runs: bool = True
+) -> list[dict[str, str]]:
     """Run Python code in another process; return the assembly of each kernel in the order of the processors.
 
     kernels: `module:name` each; `program` must have called or compiled them, so that their arguments' types are known.
+    runs: whether it calls kernels; where it does not, nothing is made for this processor.
     """
-    return _answer(CHILD, {"program": program, "kernels": kernels, "processors": list(processors)})
+    return _answer(CHILD, {"program": program, "kernels": kernels, "processors": list(processors), "runs": runs})
 
 
-def alone(program: str, kernels: list[str]) -> str:
-    """Run Python code in another process; return code that compiles the kernels that it called, for such arguments.
+def listings_alone(program: str, kernels: list[str], processors: Iterable[Processor]) -> list[dict[str, str]]:
+    """Do as `listings`, but compile no more than the kernels, for such arguments as the program called them with.
 
     It must call them itself: of what other kernels call nothing is known where these come from the disk cache.
     """
-    return _answer(CALLS, {"program": program, "kernels": kernels})
+    return listings(_answer(CALLS, {"program": program, "kernels": kernels}), kernels, processors, runs=False)
 
 
 def _answer(code: str, job: dict[str, Any]) -> Any:
@@ -146,15 +150,27 @@ def loops(text: str) -> list[str]:
     return [text[a:b] for a, b in sorted(inner)]
 
 
-def record() -> None:
-    """From now on keep what numba hands to LLVM, for `assembly_for`; call it before any kernel is compiled."""
-    plain: Any = codegen.CPUCodeLibrary.add_llvm_module
+def record(runs: bool = True) -> None:
+    """From now on keep what numba hands to LLVM, for `assembly_for`; call it before any kernel is compiled.
+
+    runs: whether kernels will be called; where not, LLVM is spared the making of them for this processor.
+    """
+    library: Any = codegen.JITCodeLibrary
+    plain = library.add_llvm_module
+
+    def keep(self: Any, text: str) -> None:
+        vars(self).setdefault("recorded", []).append(text)
 
     def add_llvm_module(self: Any, ll_module: llvm.ModuleRef) -> None:
-        vars(self).setdefault("recorded", []).append(str(ll_module))
+        keep(self, str(ll_module))
         plain(self, ll_module)
 
-    codegen.CPUCodeLibrary.add_llvm_module = add_llvm_module
+    library.add_llvm_module = add_llvm_module
+    if not runs:
+        library.add_ir_module = lambda self, module: keep(self, cgutils.normalize_ir_text(str(module)))
+        library.finalize = lambda self: setattr(self, "_finalized", True)
+        library.get_pointer_to_function = lambda self, name: 0
+        codegen.JITCPUCodegen.set_env = lambda self, name, environment: None
 
 
 def find(name: str) -> Any:
@@ -170,7 +186,7 @@ def assembly_for(kernel: Any, cpu: str, triple: str = Processor("").triple) -> s
     """
     made = [overload.library for overload in kernel.overloads.values()]
     assert made, f"{kernel.py_func.__name__} was not compiled"
-    other = _OtherProcessor(cpu, triple)
+    other = _other_processor(cpu, triple)
     with global_compiler_lock:
         return "\n".join(other.listing(library) for library in made)
 
@@ -219,3 +235,9 @@ class _OtherProcessor(codegen.CPUCodegen):
                 again.add_linking_library(self._again(linked))
             again.finalize()
         return self._made[library]
+
+
+@lru_cache
+def _other_processor(cpu: str, triple: str) -> _OtherProcessor:
+    """Return one for all kernels, which share much of what they call."""
+    return _OtherProcessor(cpu, triple)

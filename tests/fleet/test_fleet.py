@@ -271,6 +271,17 @@ def test_damage_of_what_is_kept_is_told_with_the_cure(mapped, tmp_path, kind):
     assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
 
 
+def test_a_bit_that_flips_in_what_frames_see_is_told(mapped, tmp_path):
+    """It would take a frame out of a box, or put it into another one."""
+    mapped([recording(1)], tmp_path / "m.svox")
+    (seen,) = (tmp_path / "m.svox/recordings").glob("*/seen.npy")
+    content = bytearray(seen.read_bytes())
+    content[-16] ^= 1
+    seen.write_bytes(content)
+    with pytest.raises(MapFileError, match=r"recordings/\w+: is damaged .*; remove it and run again with --resume"):
+        mapped([recording(1)], tmp_path / "m.svox", resume=True)
+
+
 def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, tmp_path):
     shutil.copytree(recording(2), tmp_path / "drive")
     made = mapped([recording(1), tmp_path / "drive"], tmp_path / "m.svox")

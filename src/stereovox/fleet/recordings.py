@@ -32,7 +32,7 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
-from stereovox.maps.kept_frames import KeptFrame
+from stereovox.maps.kept_frames import KeptFrame, digest_of
 from stereovox.maps.store import MANIFEST, MAX_MANIFEST, is_map
 from stereovox.opening import is_recording
 from stereovox.places import Bucket, Folder, Place, is_url
@@ -42,7 +42,7 @@ from stereovox.run import MapRun
 from stereovox.safe_io import json_value
 from stereovox.sources.bags.recording import file_part
 
-VERSION = 1
+VERSION = 2
 """Of what is kept of a recording; another one is made anew."""
 RECORDINGS = "recordings"
 SEEN, REPORT = "seen.npy", "report.json"
@@ -146,6 +146,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
         rows = np.column_stack([numbers, np.concatenate(seen)]).astype(np.int32)
         array = io.BytesIO()
         np.save(array, rows)
+        manifest["seen"] = digest_of(array.getvalue())
         home.write_all({MANIFEST: json.dumps(manifest).encode(), SEEN: array.getvalue()})
         refused = {str(why): int(number) for why, number in manifest["history"]["refused"].items()}
     report = RecordingReport(recording.where, len(seen), refused, perf_counter() - started, notes=notes)
@@ -186,13 +187,9 @@ def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
     Raises MapFileError where that is damaged.
     """
     data = (place / f"{RECORDINGS}/{key}").read(SEEN)
-    try:
-        rows = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise _damaged(place, key, error) from None
-    if rows.ndim != 2 or rows.shape[1] != 4 or rows.dtype != np.int32:
-        raise _damaged(place, key, f"{SEEN} holds {rows.dtype} {rows.shape}")
-    return rows
+    if digest_of(data) != manifest_of(place, key).get("seen"):
+        raise _damaged(place, key, f"{SEEN} does not match its digest")
+    return np.load(io.BytesIO(data), allow_pickle=False)
 
 
 def manifest_of(place: Place, key: str) -> dict[str, Any]:

@@ -435,12 +435,14 @@ def test_names_of_recordings(tmp_path):
             recordings_of(names)
     assert len(recordings_of([f"{recording(1)}?depth=/a", f"{recording(1)}?depth=/b"])) == 2
     (tmp_path / "list.txt").write_text("a b c\n")
+    for one in (recording(1), Path(recording(1)), Recording(recording(1))):
+        assert recordings_of(one) == [Recording(recording(1))]
     with pytest.raises(StereovoxError, match=r"list\.txt:1: 3 words"):
         recordings_of([f"@{tmp_path / 'list.txt'}"])
 
 
 def test_names_in_a_list_count_from_where_it_is(tmp_path, monkeypatch):
-    (tmp_path / "list.txt").write_text("drives/a ../poses/a.tum\nsim:room\ns3://city/b\n/c\n")
+    (tmp_path / "list.txt").write_bytes("\ufeffdrives/a ../poses/a.tum\r\nsim:room\ns3://city/b\n/c\n".encode())
     names = ["drives/a", "sim:room", "s3://city/b", "/c"]
     monkeypatch.chdir(tmp_path)
     assert [one.where for one in recordings_of(["@list.txt"])] == names
@@ -466,6 +468,32 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PATIENCE_S", 0.5)
     with pytest.raises(StereovoxError, match="no Dask scheduler answers"):
         map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "m.svox").exists()  # the next run begins anew
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_workers_that_cannot_be_are_told(tmp_path, workers):
+    with pytest.raises(StereovoxError, match=f"{workers} workers: give 1 or more"):
+        map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, workers=workers)
+    assert not (tmp_path / "m.svox").exists()
+
+
+def test_workers_of_another_version_are_named(mapped, tmp_path, monkeypatch):
+    """They would end at the first task, and nobody would say so."""
+    monkeypatch.setattr(cluster, "__version__", "9.9")
+    with pytest.raises(StereovoxError, match=rf"this worker has {sv.__version__}, here is 9\.9; install"):
+        mapped([recording(1)], tmp_path / "m.svox")
+    without = SimpleNamespace(run=lambda *given, **how: {"tcp://a": ImportError("stereovox"), "tcp://b": OSError()})
+    assert cluster._versions(without) == {"tcp://a": "no stereovox"}
+
+
+def test_a_scheduler_without_workers_is_told():
+    said = []
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address="127.0.0.1:0") as local,
+        cluster.cluster(local.scheduler_address, None, said.append),
+    ):
+        assert "has no workers yet; waiting" in said[0]
 
 
 def test_keys_know_what_frames_depend_on(tmp_path):

@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from os import cpu_count
+from pkgutil import resolve_name
 from typing import Any
 from uuid import uuid4
 
+from stereovox import __version__
 from stereovox.errors import MissingExtra, StereovoxError
 
 LOST_WORKERS = 20
@@ -73,9 +75,24 @@ def _result(future: Any) -> Any:
     return future.result()
 
 
+def _versions(client: Any) -> dict[str, str]:
+    """Return which stereovox the workers have. Without the same one they end at a task that they cannot read."""
+    found = client.run(resolve_name, "stereovox.__version__", on_error="return")
+    without = ImportError, AttributeError
+    versions = {one: "no stereovox" if isinstance(said, without) else said for one, said in found.items()}
+    return {one: said for one, said in versions.items() if isinstance(said, str)}  # others have just gone
+
+
 @contextmanager
-def cluster(scheduler: str | None, workers: int | None) -> Iterator[Cluster]:
-    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it."""
+def cluster(
+    scheduler: str | None, workers: int | None, notify: Callable[[str], object] = lambda line: None
+) -> Iterator[Cluster]:
+    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it.
+
+    Raises StereovoxError where no scheduler answers, and for a number of workers that cannot be.
+    """
+    if workers is not None and workers < 1:
+        raise StereovoxError(f"{workers} workers: give 1 or more, or leave it out for one on each core")
     try:
         import dask.config
         from distributed import Client, LocalCluster
@@ -88,6 +105,13 @@ def cluster(scheduler: str | None, workers: int | None) -> Iterator[Cluster]:
             except (OSError, ValueError, TimeoutError) as error:
                 raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
             with client:
+                versions = _versions(client)
+                if wrong := next(((one, theirs) for one, theirs in versions.items() if theirs != __version__), None):
+                    raise StereovoxError(
+                        f"{wrong[0]}: this worker has {wrong[1]}, here is {__version__}; install the same on all"
+                    )
+                if not versions:
+                    notify(f"note: {scheduler} has no workers yet; waiting for some (dask worker {scheduler})")
                 yield Cluster(client)
             return
         number = workers or cpu_count() or 1

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
@@ -21,6 +21,7 @@ from stereovox.fleet.recordings import (
     RECORDINGS,
     Recording,
     RecordingReport,
+    Recordings,
     boxes_seen,
     frames_of,
     index_recording,
@@ -49,7 +50,7 @@ from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
 
 SETTINGS = "fleet.json"
-"""The settings that a place's recordings are mapped with, written before anything else."""
+"""The settings that a place's recordings are mapped with, written once there are workers, before anything else."""
 MAX_SETTINGS = 1 << 20
 MOST_BOXES = 250_000
 """That a manifest can name, with those of the levels and with what all are made of."""
@@ -102,7 +103,7 @@ class FleetMap:
 
 
 def map_fleet(
-    recordings: Iterable[str | Path | Recording],
+    recordings: Recordings,
     out: str | Path,
     *,
     profile: str | Path | Config | None = None,
@@ -151,7 +152,8 @@ def map_fleet(
     with ended_in_order(), only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
         keys = {one: one.key(layout) for one in listed}  # once: files may change meanwhile
-        with cluster(scheduler, workers) as run:
+        with cluster(scheduler, workers, notify) as run:
+            place.write(SETTINGS, json.dumps(_settings(layout)).encode())
             reports = _indexed(run, place, keys, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
@@ -166,7 +168,7 @@ def map_fleet(
             if len(boxes) > MOST_BOXES:
                 raise StereovoxError(
                     f"{len(boxes):,} boxes of {layout.side} cells: a map has at most {MOST_BOXES:,}; choose larger "
-                    "boxes (--box-m, at most 512 cells), or make several maps"
+                    "boxes (--box, at most 512 cells), or make several maps"
                 )
             before = BoxesBefore(place)
             done, mapped = _mapped(run, place, layout, boxes, before, progress)
@@ -240,15 +242,16 @@ def _layout(
     if known is None and place.find(MANIFEST) is not None:
         raise MapFileError(f"{place}: is a map that no fleet made, and would be lost; choose another name")
     if known is not None and not resume:
-        raise MapFileError(f"{place}: there is a map already; go on with it with --resume, or choose another name")
+        raise MapFileError(
+            f"{place}: there is a map already, or what was begun of one; go on with it with --resume, "
+            "or choose another name"
+        )
     config, lines = settings_for(listed, known.config if known is not None and profile is None else profile, overrides)
     layout = BoxLayout(config, known.side if known is not None and box_m is None else box_side(box_m, config))
     if known is not None and (_settings(layout) != _settings(known)):
         raise MapFileError(f"{place}: was made with other settings; leave them out to go on, or choose another name")
     for line in lines:
         notify(f"note: {line}")
-    if known is None:
-        place.write(SETTINGS, json.dumps(_settings(layout)).encode())
     return layout
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
@@ -14,7 +14,7 @@ import numpy as np
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError, without_name
 from stereovox.fleet.fleet import box_side, settings_for
-from stereovox.fleet.recordings import Recording, boxes_with, recordings_of
+from stereovox.fleet.recordings import Recording, Recordings, boxes_with, recordings_of
 from stereovox.mapper import Mapper
 from stereovox.maps.boxes import BoxLayout
 from stereovox.opening import open_source
@@ -53,7 +53,7 @@ class FleetPlan:
 
 
 def plan_fleet(
-    recordings: Iterable[str | Path | Recording],
+    recordings: Recordings,
     *,
     profile: str | Path | Config | None = None,
     box_m: float | None = None,

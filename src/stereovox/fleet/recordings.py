@@ -71,6 +71,10 @@ class Recording:
         return digest([VERSION, self.where, files, settings])
 
 
+Recordings = str | Path | Recording | Iterable[str | Path | Recording]
+"""One or more recordings; see `recordings_of`."""
+
+
 @dataclass(frozen=True)
 class RecordingReport:
     """What a recording gave.
@@ -96,12 +100,12 @@ class RecordingReport:
         return {**vars(self), "notes": list(self.notes)}
 
 
-def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
+def recordings_of(names: Recordings) -> list[Recording]:
     """Return the recordings that names stand for, in their order.
 
     Args:
-        names: Recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: in each line a recording, and the
-            file of its corrected poses if there is one, both from where the list is; # begins a comment), or
+        names: One or more: recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: in each line a recording,
+            and the file of its corrected poses if there is one, both from where the list is; # begins a comment), or
             `Recording`.
 
     Returns:
@@ -112,7 +116,7 @@ def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
             also by the name of a link.
     """
     found: list[Recording] = []
-    for name in names:
+    for name in [names] if isinstance(names, (str, Path, Recording)) else names:
         found += [name] if isinstance(name, Recording) else _expanded(str(name))
     if not found:
         raise StereovoxError("no recording is named; give one or more")
@@ -373,7 +377,7 @@ def _real(where: str) -> str:
 
 def _listed(file: Path) -> list[Recording]:
     try:
-        lines = file.read_text().splitlines()
+        lines = file.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise StereovoxError(f"{file}: the list cannot be read ({error}); write a recording in each line") from None
     found: list[Recording] = []

@@ -21,7 +21,7 @@ from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.fleet.cluster import cluster
 from stereovox.fleet.fleet import Progress, suggested
-from stereovox.fleet.recordings import Recording, digest, fingerprint, local, recordings_of, why_not
+from stereovox.fleet.recordings import Recording, Recordings, digest, fingerprint, local, recordings_of, why_not
 from stereovox.maps.boxed_manifest import only_writer_at
 from stereovox.maps.store import MANIFEST
 from stereovox.opening import open_source
@@ -116,7 +116,7 @@ class FleetScores:
 
 
 def score_fleet(
-    recordings: Iterable[str | Path | Recording],
+    recordings: Recordings,
     out: str | Path,
     profiles: Iterable[str | Path | Config] | None = None,
     *,
@@ -173,7 +173,7 @@ def score_fleet(
         tasks = {next(iter(each)): (place, one, each, options) for one, each in missing.items() if each}
         before = len(listed) - len(tasks)
         progress(before, len(listed), "recordings")
-        with cluster(scheduler, workers) as run:
+        with cluster(scheduler, workers, notify) as run:
             for n, (_, found) in enumerate(run.results(score_recording, tasks), before + 1):
                 rows |= found
                 progress(n, len(listed), "recordings")

@@ -608,7 +608,7 @@ def interrupt_between_steps() -> Iterator[Callable[[], None]]:
 def ended_in_order() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end what runs as Ctrl-C does: the first raises KeyboardInterrupt, which holds its number.
 
-    What cleans up after that is not disturbed by those that follow.
+    What cleans up after that is not disturbed by those that follow, nor by another Ctrl-C.
     """
     before = {}
 
@@ -619,7 +619,7 @@ def ended_in_order() -> Iterator[None]:
 
     try:
         if threading.current_thread() is threading.main_thread():
-            before.update({one: signal.signal(one, end) for one in _default_signals() if one != signal.SIGINT})
+            before.update({one: signal.signal(one, end) for one in _default_signals()})
         yield
     finally:
         for one, handler in before.items():

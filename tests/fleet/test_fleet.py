@@ -8,6 +8,8 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
@@ -312,8 +314,10 @@ def test_two_fleets_do_not_write_one_map(mapped, where):
     assert "s3:" not in where or f"process {os.getpid()} on {socket.gethostname()} since 20" in str(refused.value)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_fleet_that_is_told_to_end_gives_the_map_to_the_next(mapped, where, monkeypatch, number):
+    before = signal.getsignal(number)
+
     def told(*words):
         os.kill(os.getpid(), number)
         time.sleep(5)
@@ -323,8 +327,24 @@ def test_a_fleet_that_is_told_to_end_gives_the_map_to_the_next(mapped, where, mo
         with pytest.raises(KeyboardInterrupt) as stopped:
             mapped([recording(1)], where)
     assert stopped.value.args == (number,)
-    assert signal.getsignal(number) == signal.SIG_DFL
+    assert signal.getsignal(number) == before
     assert_same(mapped([recording(1)], where, resume=True).map.storage.blocks(), alone(recording(1)).storage.blocks())
+
+
+def test_ctrl_c_at_a_terminal_is_one_line(tmp_path, obeys_signals):
+    """A terminal sends it to the workers as well."""
+    words = "fleet", recording(1), "--out", "m.svox", "--voxel-size", "0.2", "--box", "1.6", "--workers", "1"
+    with subprocess.Popen(
+        [sys.executable, "-m", "stereovox", *words],
+        cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as run:  # fmt: skip
+        while run.poll() is None and not list((tmp_path / "m.svox").glob("done/*")):
+            time.sleep(0.05)
+        os.killpg(run.pid, signal.SIGINT)
+        said = run.communicate()[1]
+    assert run.returncode == 130
+    assert "Traceback" not in said
+    assert said.endswith("stereovox: stopped\n")
 
 
 @pytest.mark.parametrize(
@@ -483,8 +503,9 @@ def test_workers_of_another_version_are_named(mapped, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "__version__", "9.9")
     with pytest.raises(StereovoxError, match=rf"this worker has {sv.__version__}, here is 9\.9; install"):
         mapped([recording(1)], tmp_path / "m.svox")
-    without = SimpleNamespace(run=lambda *given, **how: {"tcp://a": ImportError("stereovox"), "tcp://b": OSError()})
-    assert cluster._versions(without) == {"tcp://a": "no stereovox"}
+    without = SimpleNamespace(run=lambda *given, **how: {"tcp://a": OSError(), "tcp://b": ImportError("stereovox")})
+    with pytest.raises(StereovoxError, match="tcp://b: this worker has no stereovox"):
+        cluster._check_workers(without, "tcp://s", print)
 
 
 def test_a_scheduler_without_workers_is_told():

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from os import cpu_count
 from pkgutil import resolve_name
 from typing import Any
@@ -75,14 +77,6 @@ def _result(future: Any) -> Any:
     return future.result()
 
 
-def _versions(client: Any) -> dict[str, str]:
-    """Return which stereovox the workers have. Without the same one they end at a task that they cannot read."""
-    found = client.run(resolve_name, "stereovox.__version__", on_error="return")
-    without = ImportError, AttributeError
-    versions = {one: "no stereovox" if isinstance(said, without) else said for one, said in found.items()}
-    return {one: said for one, said in versions.items() if isinstance(said, str)}  # others have just gone
-
-
 @contextmanager
 def cluster(
     scheduler: str | None, workers: int | None, notify: Callable[[str], object] = lambda line: None
@@ -105,20 +99,40 @@ def cluster(
             except (OSError, ValueError, TimeoutError) as error:
                 raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
             with client:
-                versions = _versions(client)
-                if wrong := next(((one, theirs) for one, theirs in versions.items() if theirs != __version__), None):
-                    raise StereovoxError(
-                        f"{wrong[0]}: this worker has {wrong[1]}, here is {__version__}; install the same on all"
-                    )
-                if not versions:
-                    notify(f"note: {scheduler} has no workers yet; waiting for some (dask worker {scheduler})")
+                _check_workers(client, scheduler, notify)
                 yield Cluster(client)
             return
         number = workers or cpu_count() or 1
-        local: Any = LocalCluster(
-            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-            dashboard_address="127.0.0.1:0",
-        )  # fmt: skip
+        with _spared_ctrl_c():
+            local: Any = LocalCluster(
+                n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+                dashboard_address="127.0.0.1:0",
+            )  # fmt: skip
         with local as cluster, Client(cluster) as client:
             cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
             yield Cluster(client)
+
+
+def _check_workers(client: Any, scheduler: str, notify: Callable[[str], object]) -> None:
+    """Raise StereovoxError where a worker has not this stereovox: it would end at a task, which it cannot read."""
+    versions = client.run(resolve_name, "stereovox.__version__", on_error="return")
+    for worker, theirs in versions.items():
+        theirs = "no stereovox" if isinstance(theirs, (ImportError, AttributeError)) else theirs
+        if isinstance(theirs, str) and theirs != __version__:  # else it has just gone
+            raise StereovoxError(f"{worker}: this worker has {theirs}, here is {__version__}; install the same on all")
+    if not versions:
+        notify(f"note: {scheduler} has no workers yet; waiting for some (dask worker {scheduler})")
+
+
+@contextmanager
+def _spared_ctrl_c() -> Iterator[None]:
+    """Keep Ctrl-C from the threads and processes that are begun here, and by these: who waits for them ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # it would let Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

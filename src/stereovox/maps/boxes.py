@@ -43,6 +43,8 @@ PACKED_BEST = 100
 MISSING = (1 << 64) - 1
 """Marks an inner chunk that a shard does not hold."""
 ARRAYS = ("coords", "cells", "times")
+CURE = "make the map anew (a fleet makes what is missing with --resume)"
+"""Of a box that cannot be read."""
 
 Index = tuple[int, int, int]
 
@@ -201,8 +203,9 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
     files = [f"{entry.name}/{_shard(name)}" for name in ARRAYS[: len(layout.dtypes)]]
     shards = [data for file in files if (data := place.find(file, entry.bytes)) is not None]
     if len(shards) < len(files):
-        why = "was the map made anew meanwhile? load it again"
-        raise MapFileError(f"{place}/{entry.name}: is not there; {why}, or make box {entry.box} anew")
+        raise MapFileError(
+            f"{place}/{entry.name}: is not there; was the map made anew meanwhile? load it again, or {CURE}"
+        )
     try:
         if tuple(map(zlib.crc32, shards)) != entry.checksum:
             raise ValueError("the cells do not match their checksum")
@@ -217,7 +220,7 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
             raise ValueError(f"not {entry.rows} blocks with numbers, as the manifest says")
     except (ValueError, TypeError, KeyError, RuntimeError, OSError, struct.error) as error:
         raise MapFileError(
-            f"{place}/{entry.name}: damaged box ({type(error).__name__}: {error}); make box {entry.box} anew"
+            f"{place}/{entry.name}: damaged box ({type(error).__name__}: {error}); remove it and {CURE}"
         ) from None
     return BoxBlocks(coords, cells, times[0] if times else None, entry.times_start_ns)
 

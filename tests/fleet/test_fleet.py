@@ -474,11 +474,13 @@ def test_names_in_a_list_count_from_where_it_is(tmp_path, monkeypatch):
 
 
 def test_patterns_leave_out_what_lies_beside_recordings(tmp_path):
-    """Calibrations of KITTI, and the map itself; a file that may be a broken recording is not passed over."""
+    """Calibrations of KITTI, and the map itself, whole or begun; not a file that may be a broken recording."""
     (tmp_path / "drive").mkdir()
     (tmp_path / "calib_cam_to_cam.txt").write_text("K_00: 1\n")
     (tmp_path / "empty.bag").write_text("")
     sv.VoxelMap.from_cells(sv.load_config(), [[0, 0, 0]], [1.0]).save(tmp_path / "city.svox")
+    (tmp_path / "begun.svox").mkdir()
+    (tmp_path / "begun.svox/fleet.json").write_text("{}")
     assert [Path(one.where).name for one in recordings_of([f"{tmp_path}/*"])] == ["drive", "empty.bag"]
     with pytest.raises(StereovoxError, match="no recording has such a name"):
         recordings_of([f"{tmp_path}/calib*"])

@@ -19,6 +19,7 @@ from stereovox.fleet.boxes import DONE, Box, BoxesBefore, DoneBox, boxes_of, map
 from stereovox.fleet.cluster import Cluster, cluster
 from stereovox.fleet.recordings import (
     RECORDINGS,
+    SETTINGS,
     Recording,
     RecordingReport,
     Recordings,
@@ -49,8 +50,6 @@ from stereovox.safe_io import json_value
 from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
 
-SETTINGS = "fleet.json"
-"""The settings that a place's recordings are mapped with, written once there are workers, before anything else."""
 MAX_SETTINGS = 1 << 20
 MOST_BOXES = 250_000
 """That a manifest can name, with those of the levels and with what all are made of."""

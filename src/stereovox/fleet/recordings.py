@@ -45,6 +45,8 @@ from stereovox.sources.bags.recording import file_part
 VERSION = 2
 """Of what is kept of a recording; another one is made anew."""
 RECORDINGS = "recordings"
+SETTINGS = "fleet.json"
+"""The settings that a place's recordings are mapped with, written once there are workers, before anything else."""
 SEEN, REPORT = "seen.npy", "report.json"
 TEXTS = (".txt", ".md", ".csv", ".json", ".yaml", ".yml", ".toml", ".log")
 """Endings of files that lie beside recordings and hold text."""
@@ -366,7 +368,8 @@ def _expanded(name: str) -> list[Recording]:
 
 def _lies_beside(path: str) -> bool:
     """Tell whether what a pattern fits is no recording but lies beside some: a map, or text such as calibrations."""
-    return is_map(path) or (path.lower().endswith(TEXTS) and os.path.isfile(path) and not is_recording(path))
+    begun = os.path.isfile(os.path.join(path, SETTINGS))  # a map that a fleet has not finished
+    return is_map(path) or begun or (path.lower().endswith(TEXTS) and os.path.isfile(path) and not is_recording(path))
 
 
 def _real(where: str) -> str:

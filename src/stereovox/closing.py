@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
+from stereovox.corrected_poses import load_with_frames
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.loops.closer import Loop, LoopCloser, check_one_way, ends_of
@@ -171,9 +172,7 @@ def close_loops(
         MissingExtra: gtsam is not installed.
     """
     check_target(Path(out))
-    saved = load_map(path)
-    if saved.kept_frames is None or not len(saved.kept_frames):
-        raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
+    saved, _ = load_with_frames(path)
     config = load_config(saved.config, **overrides)
     known = None if positions is None else _positions(str(positions), positions_sigma, config)
     wheels = None if odometry is None else Odometry(Trajectory(Path(odometry)), config.loops)

@@ -7,11 +7,14 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from stereovox.errors import FrameRefused
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.boxed_map import BoxedMap
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.rebuild import FrameKey
 from stereovox.se3 import Transform, apart, interpolate, inverse, orthonormalise
@@ -49,6 +52,17 @@ class _Anchor(NamedTuple):
 
     stamp_ns: int
     T_new_old: Transform
+
+
+def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
+    """Return a saved map and the frames it kept. Raises StereovoxError, which names the cure, where it kept none."""
+    saved = load_map(path)
+    if isinstance(saved, BoxedMap):
+        cure = "name better poses after the recording in the fleet's list, and go on with --resume"
+        raise StereovoxError(f"{path}: maps in boxes do not keep their frames; {cure}")
+    if saved.kept_frames is None or not len(saved.kept_frames):
+        raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
+    return saved, saved.kept_frames.frames
 
 
 def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str, Transform]) -> CorrectedPoses:

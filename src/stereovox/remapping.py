@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import Config
-from stereovox.corrected_poses import poses_by_path
+from stereovox.corrected_poses import load_with_frames, poses_by_path
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
@@ -76,10 +76,8 @@ def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str |
             nobody says of which of several sensors they are.
     """
     check_target(Path(out))
-    saved = load_map(path)
-    if saved.kept_frames is None or not len(saved.kept_frames):
-        raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
-    frames, trajectory = saved.kept_frames.frames, Trajectory(Path(poses))
+    saved, frames = load_with_frames(path)
+    trajectory = Trajectory(Path(poses))
     mounts = {_posed_sensor(frames, sensor, path): np.eye(4)}
     new = poses_by_path(frames, _in_map(trajectory, saved.config), mounts)
     if not new.poses:

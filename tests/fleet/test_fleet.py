@@ -143,6 +143,8 @@ def test_corrected_poses_make_the_map_of_remap(mapped, tmp_path):
     alone(recording(2)).save(tmp_path / "two.svox")
     corrected = sv.remap(tmp_path / "two.svox", tmp_path / "new.tum", tmp_path / "moved.svox").map
     assert_same(made.map.storage.blocks(), of_all(recording(1), corrected))
+    with pytest.raises(StereovoxError, match=r"m\.svox: maps in boxes do not keep .* in the fleet's list"):
+        sv.remap(tmp_path / "m.svox", tmp_path / "new.tum", tmp_path / "no.svox")
 
 
 def test_what_was_done_before_a_failure_stays(mapped, where, monkeypatch):

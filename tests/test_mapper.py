@@ -1,5 +1,6 @@
 """The whole flow by its Python API."""
 
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -151,6 +152,15 @@ def test_thread_count_and_a_stop_between_change_no_bit(integrator, tmp_path):
         resumed.add(frame)
     for other in (maps[1], resumed.map):
         assert all((a == b).all() for a, b in zip(maps[0].storage.blocks(), other.storage.blocks(), strict=True))
+
+
+def test_ctrl_c_does_not_cut_a_frame_in_half(obeys_signals):
+    mapper = sv.Mapper("default", voxel_size=0.1, **{"map.keep_frames": True})
+    mapper.map.listeners.append(lambda evidence: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        mapper.add(wall_frame())
+    assert (mapper.map.frames, len(mapper.map.kept_frames)) == (1, 1)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_resuming_with_another_voxel_size_is_refused():

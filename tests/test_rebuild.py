@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map with corrected poses is bit for bit the map that a new run makes of its frames at these poses."""
 
+import signal
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from made_threads import frames_of
 import stereovox as sv
 from made_clouds import room_cloud
 from stereovox.errors import FrameRefused, MapFileError, StereovoxError
+from stereovox.maps.kept_frames import KeptFrames
 from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection
 from stereovox.products.projection import project
@@ -358,6 +360,23 @@ def test_frames_may_come_while_poses_are_corrected(kind):
     assert len(reports) == 20
     assert is_as_new(mapper, [*moved, *frames[40:]], **MAPS[kind])
     mapper.close()
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_ctrl_c_while_the_result_is_put_in_place_leaves_it_whole(monkeypatch, obeys_signals, share):
+    frames = made_frames()
+    mapper = mapped(frames)
+    moved, poses = shaken(frames, 0, share)
+    replace_frames = KeptFrames.replace
+
+    def interrupted(self, frames):
+        signal.raise_signal(signal.SIGINT)
+        replace_frames(self, frames)
+
+    monkeypatch.setattr(KeptFrames, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        mapper.correct(poses)
+    assert is_as_new(mapper, moved)
 
 
 def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):

@@ -27,7 +27,7 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.rebuild import CorrectionReport, FramePoses, correct
-from stereovox.threads import MapLock
+from stereovox.threads import MapLock, uninterrupted
 from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
 from stereovox.trust.validate import validate_upright_scan
@@ -149,7 +149,7 @@ class Mapper:
             evidence = quality.integrator.evidence(image)
             evidence, passed = self._comparison.check(frame, image, evidence, passed, quality.integrator, self.map)
             packed = self._packed(depth_frame, passed)
-            with self.map.lock:
+            with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
                 self.map.storage.look_from(image.viewpoint)
                 cells = self.map.add(evidence)
@@ -306,7 +306,7 @@ class GridMapper:
             passed = offer.check(scan)
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
-            with self.map.lock:
+            with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
                 cells = self.map.add(evidence)
                 offer.accept(passed)

@@ -30,7 +30,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.kept_frames import KeptFrame, KeptFrames, blocks_seen
 from stereovox.maps.storage import Storage
 from stereovox.se3 import Transform
-from stereovox.threads import Ahead
+from stereovox.threads import Ahead, uninterrupted
 from stereovox.trust.camera_path import Seen
 from stereovox.trust.corrected import correct_history, matrix_of
 from stereovox.trust.validate import rigid_pose
@@ -119,7 +119,9 @@ def correct(
                 rebuild.close()
                 rebuild = Rebuild(storage, level, moved, tiles)
             rebuild.catch_up()
-            return replace(rebuild.finish(), ignored=ignored)
+            with uninterrupted():
+                report = rebuild.finish()
+            return replace(report, ignored=ignored)
     except BaseException:
         rebuild.close()
         raise

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threads: sharded kernels, locks of maps, and jobs of which only the newest request counts."""
+"""Threads: sharded kernels, locks of maps, steps that Ctrl-C does not cut in half, and jobs of which only the newest
+request counts."""
 
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from _thread import RLock
 from collections import deque
@@ -234,6 +236,23 @@ def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:
         if item is None:
             return
         yield item
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait until what is done here is complete, so that a map is never half changed; it is raised then."""
+    on_main = threading.current_thread() is threading.main_thread()  # others are never interrupted
+    if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    received: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if received:
+        raise KeyboardInterrupt
 
 
 def one_state(function: Callable[P, T]) -> Callable[P, T]:

@@ -149,13 +149,17 @@ def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
 
     Pipes would block, and devices never end.
     """
-    with open(path, "rb", opener=_without_waiting) as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(errno.EINVAL, "not a file")
-        if status.st_size > most:
+    with _plain_file(path) as (file, size):
+        if size > most:
             raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
-        return file.read(status.st_size)  # read() would allocate whatever size it is given
+        return file.read(size)  # read() would allocate whatever size it is given
+
+
+def read_part(path: Path, start: int, size: int) -> bytes:
+    """Return `size` bytes of a file from a place on, fewer where it ends before. Raises OSError as `read_bounded`."""
+    with _plain_file(path) as (file, whole):
+        file.seek(start)
+        return file.read(min(size, whole))
 
 
 def read_text(path: Path, most: int = MAX_SETTINGS, errors: str = "strict") -> str:
@@ -298,6 +302,16 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
     except OSError:
         return  # the folder cannot be written, so the file was never created
+
+
+@contextmanager
+def _plain_file(path: Path) -> Iterator[tuple[IO[bytes], int]]:
+    """Open a file to read it; yield it and its size. Raises OSError where it is no plain file."""
+    with open(path, "rb", opener=_without_waiting) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a file")
+        yield file, status.st_size
 
 
 def _without_waiting(path: str, flags: int) -> int:

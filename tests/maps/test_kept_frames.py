@@ -3,6 +3,7 @@
 
 import copy
 import json
+import os
 import pickle
 from dataclasses import replace
 
@@ -325,6 +326,18 @@ def test_damaged_and_missing_images_are_told_when_they_are_needed(folder):
     pack.unlink()
     with pytest.raises(MapFileError, match="load it again"):
         loaded.kept_frames.frames[1].frame()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_a_pipe_in_the_place_of_images_is_not_waited_for(folder):
+    loaded = sv.load_map(folder)
+    pack = next(path for path in folder.glob("frames-*") if path != index_of(folder)[0])
+    pack.unlink()
+    os.mkfifo(pack)
+    writer = os.open(pack, os.O_RDWR)  # or who waits would do so for ever
+    with pytest.raises(MapFileError, match="not a file"):
+        loaded.kept_frames.frames[0].frame()
+    os.close(writer)
 
 
 def test_an_image_must_unpack_to_the_size_of_its_camera():

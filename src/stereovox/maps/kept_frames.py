@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -20,7 +19,7 @@ from stereovox.errors import MapFileError
 from stereovox.frame import Cloud, Frame
 from stereovox.maps import _packing
 from stereovox.maps.evidence import Evidence
-from stereovox.safe_io import zstd_size
+from stereovox.safe_io import read_part, zstd_size
 from stereovox.se3 import Transform, apart
 from stereovox.trust.camera_path import Seen
 
@@ -81,9 +80,7 @@ class InFile:
         """Return the bytes. Raises MapFileError where they are gone or damaged."""
         file, start = place = self.place
         try:
-            with file.open("rb") as opened:
-                opened.seek(start)
-                content = opened.read(min(self.size, os.fstat(opened.fileno()).st_size))
+            content = read_part(file, start, self.size)
         except OSError as error:
             if self.place != place:  # another thread has saved the map meanwhile
                 return self.read()

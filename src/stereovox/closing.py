@@ -47,6 +47,8 @@ class LoopClosure:
         anchors: (S,) int64, numbers of the frames in the middle of all places.
         report: What the correction did to the map.
         odometry: The second odometry, and for how many steps it was of use; None where there is none.
+        positions: The positions that do not drift, and in how many places they are agreed with; None where there are
+            none.
         sensors: Which sensor took each of the N frames; empty where there is but one.
     """
 
@@ -58,6 +60,7 @@ class LoopClosure:
     anchors: NDArray[np.int64]
     report: CorrectionReport
     odometry: Odometry | None = None
+    positions: Positions | None = None
     sensors: Sequence[str] = ()
 
     @property
@@ -113,6 +116,7 @@ class LoopClosure:
             "off_m": {"median": float(np.median(offs)), "max": max(offs)} if offs else None,
             "moved_m": {"median": float(np.median(self.moved_m)), "max": float(self.moved_m.max())},
             "odometry": None if self.odometry is None else self.odometry.summary(),
+            "positions": None if self.positions is None else self.positions.summary(),
             **asdict(self.report),
         }
 
@@ -167,8 +171,9 @@ def close_loops(
         The new map, and what was found and done. Where nothing was found it is a copy.
 
     Raises:
-        StereovoxError: One line: the map cannot be read, or did not keep its frames; `positions` cannot be read, or are
-            too few or too close to each other; `odometry` cannot be read, or has no poses at the map's times.
+        StereovoxError: One line: the map cannot be read, or did not keep its frames; `positions` cannot be read, are
+            too few or too close to each other, or contradict the way; `odometry` cannot be read, has no poses at the
+            map's times, or contradicts it.
         MissingExtra: gtsam is not installed.
     """
     check_target(Path(out))
@@ -217,7 +222,8 @@ def close(
 
     Raises:
         StereovoxError: The map did not keep its frames, or was merged of several recordings; `positions` are too few
-            or too close to each other; `odometry` has no poses at the times of the frames.
+            or too close to each other, or contradict the way; `odometry` has no poses at the times of the frames, or
+            contradicts it.
         MissingExtra: gtsam is not installed.
     """
     kept = mapper.map.kept_frames
@@ -231,6 +237,8 @@ def close(
         closer.add(frame)
         progress(done, len(frames), "looking for loops")
     closer.finish(lambda done, total: progress(done, total, "laying places onto each other"), positions)
+    if positions is not None:
+        positions.check_used()
     if odometry is not None:
         odometry.check()
     corrected, known = closer.corrected(), (positions, odometry) != (None, None)
@@ -247,6 +255,7 @@ def close(
         _anchors(closer.submaps),
         report,
         odometry,
+        positions,
         [frame.sensor for frame in frames],
     )
     with mapper.map.lock:

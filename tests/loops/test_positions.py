@@ -61,6 +61,22 @@ def test_wrong_positions_hardly_pull():
     assert off_by < 1.3 * off([submap.T_map_anchor for submap in held(measured(0.05)).submaps], truth) + 0.02
 
 
+@pytest.mark.parametrize("scale", [1, 1000])
+def test_positions_of_another_unit_or_way_are_told_from_right_ones(scale):
+    positions = measured(0.05)
+    positions.places *= scale
+    positions.places[6] += scale * np.array([8, -5, 3])
+    submaps = len(held(positions).submaps)
+    if scale == 1:
+        positions.check_used()
+        assert 0 < positions.contradicted < 0.2 * positions.used
+    else:
+        with pytest.raises(
+            StereovoxError, match=f"contradicts the way in {positions.contradicted} of {submaps} places"
+        ):
+            positions.check_used()
+
+
 def test_positions_in_a_map_with_another_way_up():
     random = np.random.default_rng(2)
     anchors = random.uniform(-10, 10, (20, 3))

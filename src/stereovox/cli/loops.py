@@ -90,6 +90,9 @@ def say_closure(closure: LoopClosure) -> None:
     if closure.odometry is not None:
         used, other = closure.odometry.used, closure.odometry.contradicted
         say(f"the second odometry had a part in {used} steps between places; in {other} it contradicts the map's poses")
+    if closure.positions is not None:
+        used, other = closure.positions.used, closure.positions.contradicted
+        say(f"{used} places of the way are where the positions say, {other} are not")
     moved = summary["moved_m"]
     say(f"frames moved by {moved['median']:.3f} m (median), at most {moved['max']:.3f} m")
     if not closure.report.all_frames:

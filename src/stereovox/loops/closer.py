@@ -240,6 +240,7 @@ class LoopCloser:
             T_map_turned = start @ inverse(self.submaps[0].T_map_anchor)
             for submap in self.submaps:
                 submap.T_map_anchor = T_map_turned @ submap.T_map_anchor
+        positions.compare(positions.in_map(found, self.places, self.R_level_map), self.places)
 
     def _graph(self, positions: Sequence[Position] = ()) -> PoseGraph:
         poses = np.array([submap.T_map_anchor for submap in self.submaps])

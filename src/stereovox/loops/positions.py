@@ -17,9 +17,11 @@ ROUNDS = 20
 """Of reweighting, where some positions are wrong."""
 LEAST, WIDE = 3, 5.0
 """Positions that are needed, and by how many of their deviations they must be apart, to know how the worlds lie."""
+AWAY = 4.0
+"""Deviations by which a place may be off: 99.9 % of right ones are within (chi-squared, of three axes)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Positions:
     """Where a camera was at some times, in a world of its own: metres, with the same way up as the map.
 
@@ -28,12 +30,16 @@ class Positions:
         places: (N, 3) float64 metres.
         sigma_m: Standard deviation along each axis, in metres.
         where: Name, for messages.
+        used: Places of the way that in the end are where these say.
+        contradicted: Places that are not.
     """
 
     stamps_ns: NDArray[np.int64]
     places: NDArray[np.float64]
     sigma_m: float
     where: str = "positions"
+    used: int = 0
+    contradicted: int = 0
 
     def at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return places (M, 3) at other times, interpolated; NaN where none is near enough."""
@@ -75,6 +81,25 @@ class Positions:
             away = np.linalg.norm(a @ R.T + shift - b, axis=1)
             R, shift = _laid(a, b, 1 / (1 + (away / max(float(np.median(away)), self.sigma_m)) ** 2))  # Cauchy
         return (found @ R_level_map.T @ R.T + shift) @ R_level_map
+
+    def compare(self, found: NDArray[np.float64], places: NDArray[np.float64]) -> None:
+        """Count which places (M, 3) of the way are where these say: (M, 3) in the map, NaN where they say nothing."""
+        off_m = np.linalg.norm(found - places, axis=1)
+        self.used = int(np.count_nonzero(off_m <= AWAY * self.sigma_m))
+        self.contradicted = int(np.count_nonzero(off_m > AWAY * self.sigma_m))
+
+    def check_used(self) -> None:
+        """Raise StereovoxError where they are of another way or in another unit."""
+        if self.contradicted > self.used:
+            raise StereovoxError(
+                f"{self.where}: contradicts the way in {self.contradicted} of {self.contradicted + self.used} places; "
+                "give positions of the camera, in metres, of this way, or say how uncertain they are "
+                "(--positions-sigma) or how far its poses drift (loops.drift)"
+            )
+
+    def summary(self) -> dict[str, int]:
+        """Return its numbers for programs."""
+        return {"used": self.used, "contradicted": self.contradicted}
 
     def _check(self, found: NDArray[np.float64]) -> None:
         """Raise StereovoxError where places (M, 3), NaN where there is none, are too few or too close to each other."""

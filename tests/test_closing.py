@@ -125,8 +125,14 @@ def test_merged_recordings_are_no_single_way(mapper, tmp_path):
         sv.join(mapper.map, sv.load_map(tmp_path / "both"))
 
 
-def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, mapper, monkeypatch):
-    later = replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**8)
+@pytest.mark.parametrize("budget", [None, 100_000])
+def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, mapper, monkeypatch, budget):
+    """Also where a budget drops others for them."""
+    before = len(mapper.map.kept_frames)
+    mapper.map.kept_frames.budget = budget
+    T_world_sensor = frames[-1].T_world_sensor.copy()
+    T_world_sensor[0, 3] += 2.0  # far enough to be kept
+    later = replace(frames[-2], stamp_ns=frames[-1].stamp_ns + 10**9, T_world_sensor=T_world_sensor)
 
     class Meanwhile(MadeCloser):
         def finish(self, progress=lambda done, total: None, positions=None):
@@ -136,6 +142,7 @@ def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, ma
     monkeypatch.setattr(closing, "LoopCloser", Meanwhile)
     closing.close(mapper)
     last = mapper.map.kept_frames.frames[-1]
+    assert (len(mapper.map.kept_frames) <= before) == (budget is not None)
     assert last.stamp_ns == later.stamp_ns
     np.testing.assert_allclose(last.T_world_sensor[:3, 3] - later.T_world_sensor[:3, 3], [0, SHIFT_M, 0], atol=1e-6)
 

@@ -208,8 +208,8 @@ def close(
     positions: Positions | None = None,
     odometry: Odometry | None = None,
 ) -> LoopClosure:
-    """Find the loops of the map that a mapper makes, and correct it. Frames that other threads add meanwhile move as
-    the last one.
+    """Find the loops of the map that a mapper makes, and correct it. Frames that other threads add while loops are
+    sought move as the last one; those that they add while the map is corrected stay where they are.
 
     Args:
         mapper: Its map must keep its frames (`map.keep_frames`).
@@ -243,7 +243,9 @@ def close(
         odometry.check()
     corrected, known = closer.corrected(), (positions, odometry) != (None, None)
     later = {
-        (one.sensor, one.stamp_ns): closer.submaps[-1].bend @ one.T_world_sensor for one in kept.frames[len(frames) :]
+        (one.sensor, one.stamp_ns): closer.submaps[-1].bend @ one.T_world_sensor
+        for one in kept.frames
+        if one.number > frames[-1].number  # some of `frames` may have been dropped since, for a budget
     }
     report = mapper.correct(corrected | later) if closer.loops or known else CorrectionReport()
     closure = LoopClosure(

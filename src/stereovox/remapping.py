@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.corrected_poses import load_with_frames, poses_by_path
@@ -19,7 +20,8 @@ from stereovox.maps.kept_frames import KeptFrame
 from stereovox.maps.store import check_target
 from stereovox.products.moved import level_transform
 from stereovox.rebuild import CorrectionReport
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses import MAX_GAP_NS, Poses
+from stereovox.sources.tracker import angles
 from stereovox.sources.trajectory import Trajectory
 
 
@@ -34,7 +36,10 @@ class Remapped:
         posed: Number of frames whose pose is in the file.
         between: Number of frames between them, which were moved as their neighbours before and after.
         outside: Number of frames before the first or after the last of them, which stayed where they were.
+        repeated: Number of poses that were not used, since one before them in the file has their stamp.
+        beyond: Number of poses that were not used, since they are from before the first frame or after the last.
         moved_m: Metres by which frames moved: the median and the most.
+        turned_deg: Degrees by which they turned: the median and the most.
         way_m: Largest extent in metres of where the frames were before, along an axis.
     """
 
@@ -44,14 +49,19 @@ class Remapped:
     posed: int
     between: int
     outside: int
+    repeated: int
+    beyond: int
     moved_m: tuple[float, float]
+    turned_deg: tuple[float, float]
     way_m: float
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox remap --json`, besides those of the map."""
-        counts = {"posed": self.posed, "between": self.between, "outside": self.outside}
-        median, most = self.moved_m
-        return {**asdict(self.report), **counts, "moved_m": {"median": median, "max": most}}
+        counts = {name: getattr(self, name) for name in ("posed", "between", "outside", "repeated", "beyond")}
+        moves = {
+            name: dict(zip(("median", "max"), getattr(self, name), strict=True)) for name in ("moved_m", "turned_deg")
+        }
+        return {**asdict(self.report), **counts, **moves}
 
 
 def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str | None = None) -> Remapped:
@@ -91,13 +101,26 @@ def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str |
         raise StereovoxError(f"{poses}: a pose cannot be used ({refused})") from None
     finally:
         mapper.close()
-    before = np.array([frame.T_world_sensor[:3, 3] for frame in frames])
-    after = np.array([new.poses.get((one.sensor, one.stamp_ns), one.T_world_sensor)[:3, 3] for one in frames])
-    moved = np.linalg.norm(after - before, axis=1)
+    before = np.array([frame.T_world_sensor for frame in frames])
+    after = np.array([new.poses.get((one.sensor, one.stamp_ns), one.T_world_sensor) for one in frames])
+    moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    turned = np.degrees(angles(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]))
     return Remapped(
-        load_map(out), Path(out), report, new.posed, new.between, new.outside,
-        (float(np.median(moved)), float(moved.max())), float(np.ptp(before, axis=0).max()),
+        load_map(out), Path(out), report, new.posed, new.between, new.outside, trajectory.repeated,
+        _beyond(trajectory, frames), _median_and_most(moved), _median_and_most(turned),
+        float(np.ptp(before[:, :3, 3], axis=0).max()),
     )  # fmt: skip
+
+
+def _beyond(poses: Poses, frames: Sequence[KeptFrame]) -> int:
+    """Return how many poses are too early or too late to say anything of a frame."""
+    stamps_ns = [frame.stamp_ns for frame in frames]
+    first, last = min(stamps_ns) - MAX_GAP_NS, max(stamps_ns) + MAX_GAP_NS
+    return int(np.count_nonzero((poses.stamps_ns < first) | (poses.stamps_ns > last)))
+
+
+def _median_and_most(numbers: NDArray[np.float64]) -> tuple[float, float]:
+    return float(np.median(numbers)), float(numbers.max())
 
 
 def _posed_sensor(frames: Sequence[KeptFrame], sensor: str | None, path: str | Path) -> str:

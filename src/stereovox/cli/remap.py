@@ -17,6 +17,8 @@ EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
 
 FAR = 10.0
 """How many times the extent of their way frames may move without a note."""
+FAR_TURNED = 45.0
+"""Degrees by which half of them may turn without one."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -43,15 +45,24 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say(f"{done.posed} frames have a pose in {arguments.poses}, {done.between} were moved as their neighbours")
     if done.outside:
         say(f"note: {done.outside} frames before the first or after the last of them stayed where they were")
+    if done.repeated:
+        say(f"note: {done.repeated} lines of {arguments.poses} have the stamp of one before them, which counts")
+    if done.beyond:
+        say(f"note: {done.beyond} poses are from before the first frame or after the last, and were not used")
     if not report.all_frames:
         say(f"note: only {report.mapped} frames were kept (map.frames_budget); the map is what these make")
-    median, most = done.moved_m
+    (median, most), (turned, most_turned) = done.moved_m, done.turned_deg
     say(
-        f"{report.moved} frames moved, by {median:.2f} m (median), at most {most:.2f} m; {report.mapped} were mapped "
-        f"again, {report.blocks} blocks made anew"
+        f"{report.moved} frames moved, by {median:.2f} m and {turned:.1f} degrees (median), at most {most:.2f} m and "
+        f"{most_turned:.1f} degrees; {report.mapped} were mapped again, {report.blocks} blocks made anew"
     )
     if most > FAR * max(done.way_m, 1.0):
         say(
             f"note: that is far beyond the {done.way_m:.1f} m of their way; poses must be in metres, in the map's world"
+        )
+    if turned > FAR_TURNED:
+        say(
+            "note: that is far to turn; poses must be of the optical frame (x right, y down, z forward), quaternions "
+            "x y z w"
         )
     return {**describe_saved(done.map, out), **done.summary()}

@@ -26,6 +26,7 @@ class Poses:
     confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None where it is not known.
     where: what the poses came from, for messages: a file or topic.
     faults: why poses cannot be used, by stamp; one line each with the cure.
+    repeated: how many poses were left out, since another one with their stamp came before.
     Raises SourceError where there is no pose at all or the arrays do not fit together.
     """
 
@@ -46,6 +47,7 @@ class Poses:
             raise SourceError(f"{where}: {T.shape} poses for {stamps.shape} times; give (N,) times and (N, 4, 4) poses")
         self.stamps_ns, first = np.unique(stamps, return_index=True)
         self.T_world_body = T[first]
+        self.repeated = len(stamps) - len(first)
         self.confidence = None if confidence is None else trust[first]
         self.where = where
         self.faults = dict(faults or {})

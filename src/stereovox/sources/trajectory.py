@@ -56,7 +56,7 @@ def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[
 
 def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
     """Return the lines of a file of poses in order of time; raises SourceError where there is none or no stamp."""
-    lines = by_time(stamped_lines(path))
+    lines = sorted(stamped_lines(path), key=lambda line: line[0])
     if not lines:
         raise SourceError(f"{path}: holds no pose; write lines '{wanted}'")
     return lines
@@ -69,7 +69,7 @@ def pose_numbers(lines: Sequence[StampedLine], count: int, wanted: str) -> tuple
         try:
             row[:] = _numbers(rest, count, wanted)
         except ValueError as error:
-            faults[stamp_ns] = f"{where}: {error}; correct or delete the line"
+            faults.setdefault(stamp_ns, f"{where}: {error}; correct or delete the line")
     return rows, faults
 
 

@@ -170,9 +170,12 @@ def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tm
         sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", max_range=2.0)
 
 
-def test_loops_are_not_closed_without_frames(tmp_path):
+def test_loops_are_not_closed_without_frames(mapper, tmp_path):
     with pytest.raises(sv.StereovoxError, match="keep_frames=false: loops are closed by the frames"):
         sv.map_recording("sim:room", tmp_path / "room.svox", close_loops=True, **{"map.keep_frames": False})
+    mapper.save(tmp_path / "a.svox")
+    with pytest.raises(sv.StereovoxError, match="keep_frames=false: loops are closed by the frames"):
+        sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", **{"map.keep_frames": False})
 
 
 def test_loops_are_closed_of_as_many_frames_as_may_be_kept(tmp_path):
@@ -203,6 +206,7 @@ def test_a_second_odometry_and_fixes_of_a_bag_hold_the_way(tmp_path):
             made.fix(stamp_ns, 47 + y / 111_178, 8 + x / 76_061, 400 + z)
     positions = {"positions": tmp_path / "drive.bag", "positions_sigma": 0.02, "loops.drift": 0.1}
     closed = sv.close_loops(out, tmp_path / "p.svox", **positions)
+    assert closed.closure.summary()["positions"]["used"] > 3
     assert length(closed.closure.T_world_sensor) == pytest.approx(length(poses), rel=0.03)
 
 

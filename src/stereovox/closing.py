@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import inf
 from pathlib import Path
@@ -24,7 +24,7 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.store import check_target
 from stereovox.products.floor_axes import up_of
-from stereovox.rebuild import CorrectionReport
+from stereovox.rebuild import CorrectionReport, need_frames
 from stereovox.safe_io import check_file
 from stereovox.se3 import rotation_between
 from stereovox.sources.bags import suffix_of
@@ -176,6 +176,7 @@ def close_loops(
             map's times, or contradicts it.
         MissingExtra: gtsam is not installed.
     """
+    refuse_without_frames(overrides)
     check_target(Path(out))
     saved, _ = load_with_frames(path)
     config = load_config(saved.config, **overrides)
@@ -188,6 +189,12 @@ def close_loops(
     finally:
         mapper.close()
     return ClosedMap(load_map(out), Path(out), closure)
+
+
+def refuse_without_frames(overrides: Mapping[str, Any]) -> None:
+    """Raise StereovoxError where settings say that no frames are kept."""
+    if overrides.get("map.keep_frames") is False:
+        raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
 
 
 def _positions(location: str, sigma_m: float, config: Config) -> Positions:
@@ -226,9 +233,7 @@ def close(
             contradicts it.
         MissingExtra: gtsam is not installed.
     """
-    kept = mapper.map.kept_frames
-    if kept is None or not len(kept):
-        raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
+    kept = need_frames(mapper.map.kept_frames, "the map")
     frames, closer = kept.frames, LoopCloser(mapper.config, odometry)
     check_one_way(mapper.map.history, frames)
     if positions is not None:

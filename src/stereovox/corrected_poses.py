@@ -16,7 +16,7 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.boxed_map import BoxedMap
 from stereovox.maps.kept_frames import KeptFrame
-from stereovox.rebuild import FrameKey
+from stereovox.rebuild import FrameKey, need_frames
 from stereovox.se3 import Transform, apart, interpolate, inverse, orthonormalise
 from stereovox.sources.poses import MAX_GAP_NS, Poses
 
@@ -60,9 +60,7 @@ def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
     if isinstance(saved, BoxedMap):
         cure = "name better poses after the recording in the fleet's list, and go on with --resume"
         raise StereovoxError(f"{path}: maps in boxes do not keep their frames; {cure}")
-    if saved.kept_frames is None or not len(saved.kept_frames):
-        raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
-    return saved, saved.kept_frames.frames
+    return saved, need_frames(saved.kept_frames, f"{path}: the map").frames
 
 
 def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str, Transform]) -> CorrectedPoses:

@@ -102,13 +102,10 @@ def correct(
     no_frame_comes: entered while the result is put into the map; before, the map may take in frames. tiles: as in
     `make_map`.
     """
-    if storage.kept is None or not len(storage.kept):
-        raise StereovoxError(
-            "the map did not keep its frames, so their poses cannot be corrected; map again with map.keep_frames=true"
-        )
-    moved, ignored = moved_frames(storage.kept.frames, poses, storage.config)
+    kept = need_frames(storage.kept, "the map")
+    moved, ignored = moved_frames(kept.frames, poses, storage.config)
     if not moved:
-        return CorrectionReport(ignored=ignored, all_frames=storage.kept.are_all(storage.history.frames))
+        return CorrectionReport(ignored=ignored, all_frames=kept.are_all(storage.history.frames))
     rebuild = Rebuild(storage, level, moved, tiles)
     try:
         for _ in range(ROUNDS):
@@ -125,6 +122,13 @@ def correct(
     except BaseException:
         rebuild.close()
         raise
+
+
+def need_frames(kept: KeptFrames | None, where: str) -> KeptFrames:
+    """Return the kept frames of a map. Raises StereovoxError where there are none; `where`: names the map."""
+    if kept is None or not len(kept):
+        raise StereovoxError(f"{where} did not keep its frames; map again with map.keep_frames=true")
+    return kept
 
 
 def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config) -> tuple[dict[int, Transform], int]:

@@ -20,7 +20,7 @@ from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from stereovox.closing import LoopClosure, close
+from stereovox.closing import LoopClosure, close, refuse_without_frames
 from stereovox.config import Config, load_config
 from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
@@ -234,8 +234,7 @@ class MapRun:
         self._checkpoint_s, self._level, self._poses = checkpoint_s, level, poses
         self._close_loops = close_loops
         if close_loops:
-            if overrides.get("map.keep_frames") is False:
-                raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
+            refuse_without_frames(overrides)
             self._overrides = {"map.keep_frames": True, **overrides}
 
     def __enter__(self) -> MapRun:

@@ -93,6 +93,14 @@ def test_worlds_that_differ_are_joined_by_their_transform():
     assert equal(both, mapped([*every[:7], *there]))
 
 
+def test_a_transform_that_leads_nowhere_is_refused():
+    every = frames()
+    T_a_b = np.eye(4)
+    T_a_b[0, 3] = 1e9
+    with pytest.raises(StereovoxError, match="the transform takes frames 1e\\+06 m away"):
+        sv.merge(mapped(every[:7]), mapped(every[7:]), T_a_b)
+
+
 @pytest.mark.parametrize(
     ("of_a", "of_b", "said"),
     [

@@ -27,6 +27,7 @@ from stereovox.rebuild import Rebuild, as_corrected
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 from stereovox.trust.loop_lines import LoopLines
+from stereovox.trust.validate import MAX_POSITION
 
 OF_WORLD = {"up", "up_direction", "levelled_from"}
 """Settings that may differ where a transform says how the worlds lie."""
@@ -177,6 +178,8 @@ def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
     theirs = b.kept_frames.frames
     if not np.array_equal(T_a_b, np.eye(4)):
         theirs = [replace(frame, T_world_sensor=T_a_b @ frame.T_world_sensor) for frame in theirs]
+        if np.abs([frame.T_world_sensor for frame in theirs]).max() >= MAX_POSITION:
+            raise StereovoxError(f"the transform takes frames {MAX_POSITION:g} m away or farther; give it in metres")
     return _of_frames(a, b, a.kept_frames.frames, theirs)
 
 

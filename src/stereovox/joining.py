@@ -23,7 +23,7 @@ from stereovox.products.merge import merge as added
 from stereovox.products.merge import together
 from stereovox.products.moved import rigid
 from stereovox.products.side_by_side import check_alike
-from stereovox.rebuild import Rebuild, as_corrected
+from stereovox.rebuild import Rebuild, as_corrected, need_frames
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 from stereovox.trust.loop_lines import LoopLines
@@ -162,6 +162,12 @@ def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str |
             return "a map was made within bounds (window, max_memory)"
     differing = _differing(a.config, b.config, set() if T_a_b is None else OF_WORLD)
     return None if differing is None else f"they were made with different settings ({differing})"
+
+
+def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
+    """Return how many kept frames two maps have in common; `merge` counts them once."""
+    ours, theirs = ({_identity(frame) for frame in need_frames(one.kept_frames, "a map").frames} for one in (a, b))
+    return len(ours & theirs)
 
 
 def _differing(a: Config, b: Config, ignored: set[str]) -> str | None:

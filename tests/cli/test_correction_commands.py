@@ -113,7 +113,10 @@ def test_merge_says_whether_it_is_exact(maps, tmp_path, told_with_notes):
     result, said = told_with_notes("merge", maps / "a.svox", maps / "b.svox", "--out", tmp_path / "both.svox")
     assert result["exact"] is True
     assert "added up" not in said
+    assert "in both" not in said
     assert len(sv.load_map(tmp_path / "both.svox").kept_frames) == 8
+    _, said = told_with_notes("merge", tmp_path / "both.svox", maps / "b.svox", "--out", tmp_path / "again.svox")
+    assert "note: 4 frames are in both maps and count once" in said
     result, said = told_with_notes("merge", maps / "a.svox", maps / "bare.svox", "--out", tmp_path / "added.svox")
     assert result["exact"] is False
     assert "evidence is added up, since a map did not keep its frames" in said

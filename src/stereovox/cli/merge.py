@@ -46,7 +46,7 @@ def add_transform(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps and save the merged one."""
-    from stereovox.joining import merge, why_added
+    from stereovox.joining import frames_in_both, merge, why_added
 
     if Path(arguments.a).resolve() == Path(arguments.b).resolve():
         raise StereovoxError(f"{arguments.b}: is the first map too, its frames would count twice; name another map")
@@ -60,6 +60,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say(
             f"note: evidence is added up, since {why}; cells at their limits may differ from those of one run over both"
         )
+    elif (both := frames_in_both(a, b)) > 0:
+        say(f"note: {both} frames are in both maps and count once, from their poses in A")
     return {**save_new(merged, arguments.out), "exact": why is None}
 
 

@@ -159,6 +159,15 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     assert "already holds all 12 frames" in told[-1]
 
 
+def test_who_goes_on_without_the_kept_frames_is_told(tmp_path):
+    out, told = tmp_path / "a.svox", []
+    sv.map_recording(SOURCE, out, voxel_size=0.1, frames=":4", **{"map.keep_frames": True})
+    sv.map_recording(SOURCE, out, resume=True, frames=":6", notify=told.append)
+    assert not any("given up" in line for line in told)
+    sv.map_recording(SOURCE, out, resume=True, frames=":8", notify=told.append, **{"map.keep_frames": False})
+    assert any("the 6 frames that the map kept are given up (map.keep_frames=false)" in line for line in told)
+
+
 def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
     out = tmp_path / "a.svox"
     with pytest.raises(sv.StereovoxError, match="no map to go on with"):

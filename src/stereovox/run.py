@@ -253,6 +253,7 @@ class MapRun:
                     f"{self.out}: its poses were corrected, so the next frames do not fit; begin a new map"
                 )
             suggested, lines = self._prepare(saved)
+            given_up = len(saved.kept_frames or ()) if saved else 0  # asked now, since the mapper goes on with that map
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
             self._recorded = self.source
@@ -265,6 +266,9 @@ class MapRun:
             self._check_recording()
             if not self._resume and is_map(self.out):
                 self._notify(replaces(self.out))
+            if given_up and self.mapper.map.kept_frames is None:
+                lost = f"the {given_up} frames that the map kept are given up (map.keep_frames=false)"
+                lines = [*lines, f"{lost}; its poses can then not be corrected any more"]
             for note in (*self.source.notes, *lines):
                 self._notify(f"note: {note}")
             self._open = stack.pop_all()

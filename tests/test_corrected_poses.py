@@ -73,6 +73,18 @@ def test_where_frames_come_rarely_poses_are_interpolated_at_their_stamps():
         np.testing.assert_allclose(found.poses["camera 0", frame.stamp_ns], path.at(frame.stamp_ns))
 
 
+def test_of_two_poses_within_half_a_millisecond_of_a_frame_the_other_moves_nothing():
+    some = frames()
+    kept = mapped(some).map.kept_frames.frames
+    stamps = [some[2].stamp_ns, some[2].stamp_ns + MS // 3, some[6].stamp_ns]
+    far = motion((0, 0, 0), (5.0, 0, 0))
+    poses = [T @ frame.T_world_sensor for T, frame in zip((D, far, D), (some[2], some[2], some[6]), strict=True)]
+    found = sv.poses_by_path(kept, sv.Poses(stamps, poses), {"camera 0": np.eye(4)})
+    assert len(found.poses) == 5
+    for frame in some[2:7]:
+        np.testing.assert_allclose(found.poses["camera 0", frame.stamp_ns], D @ frame.T_world_sensor, rtol=0, atol=1e-9)
+
+
 def test_poses_of_a_body_move_what_is_mounted_on_it_and_others_as_these():
     T_body_camera = motion((0.1, 0.2, -0.3), (0.2, 0.0, 0.5))
     both = sorted(

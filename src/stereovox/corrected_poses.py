@@ -66,11 +66,11 @@ def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
 def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str, Transform]) -> CorrectedPoses:
     """Find out where frames belong by a path of corrected poses, such as the key poses of a pose graph.
 
-    A frame has the pose whose stamp is within half a millisecond of its own. Where frames come rarely and poses often,
-    it is interpolated between two, each less than 0.1 s away. Poses that belong to no frame are compared with where the
-    frames around them, each less than 0.1 s away, say that the body was. All other frames, also those of sensors
-    without a mount, are moved as what is known before and after them: the way that both would move them, interpolated
-    in time.
+    A frame has the nearest pose whose stamp is within half a millisecond of its own. Where frames come rarely and
+    poses often, it is interpolated between two, each less than 0.1 s away. Poses that belong to no frame are compared
+    with where the frames around them, each less than 0.1 s away, say that the body was. All other frames, also those
+    of sensors without a mount, are moved as what is known before and after them: the way that both would move them,
+    interpolated in time.
 
     Args:
         frames: Kept frames of a map (`VoxelMap.kept_frames`), in any order.
@@ -267,12 +267,15 @@ def _beside(stamps_ns: Sequence[int], stamp_ns: int) -> set[int]:
 
 
 def _where(frames: Sequence[KeptFrame], stamp_ns: int) -> Transform | None:
-    """Return where a sensor was at a time between two of its frames, in order; None where one is 0.1 s or more away."""
+    """Return where a sensor was at a time between two of its frames, in order; None where one is 0.1 s or more away,
+    or so near that another pose, which is nearer, is its own.
+    """
     after = bisect_left(frames, stamp_ns, key=lambda frame: frame.stamp_ns)
     if after in (0, len(frames)):
         return None
     one, other = frames[after - 1], frames[after]
-    if max(stamp_ns - one.stamp_ns, other.stamp_ns - stamp_ns) >= MAX_GAP_NS:
+    gaps = stamp_ns - one.stamp_ns, other.stamp_ns - stamp_ns
+    if max(gaps) >= MAX_GAP_NS or min(gaps) <= SAME_NS:
         return None
     share = (stamp_ns - one.stamp_ns) / (other.stamp_ns - one.stamp_ns)
     return interpolate(one.T_world_sensor, other.T_world_sensor, share)

@@ -76,14 +76,3 @@ def test_bad_values_are_refused():
         LevelWays(hall(size=1.0), (0, np.nan, 0), 0.3)
     with pytest.raises(StereovoxError, match="--level"):
         LevelWays(hall(size=1.0, up="y"), (0, 0, 0), 0.3)
-
-
-def test_the_nearest_place_apart_from_others_is_come_to():
-    voxel_map = hall(occupied=[WALL], size=3.0)
-    ways = LevelWays(voxel_map, (0, 0, 0), 0.3)
-    way = ways.way_apart([(-1, 1, 0), (-1, -1, 0), (0.3, -2, 0), (0.3, 0, 5)], 2.0)
-    assert way[0].tolist() == [0, 0, 0]
-    ends = np.linalg.norm(way[-1, :2] - [(-1, 1), (-1, -1), (0.3, -2), (0.3, 0)], axis=1)
-    assert 2.0 < ends.min() < 2.2
-    assert ways.way_apart([(0, 0, 0)], 9.0) is None
-    assert ways.way_apart(np.empty((0, 3)), 9.0).shape == (2, 3)  # where it is

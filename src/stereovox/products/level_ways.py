@@ -78,21 +78,6 @@ class LevelWays:
         away = np.linalg.norm(places[:, :2] - np.asarray(goal, float)[:2], axis=1)
         return None if away.min() > near else self._way(int(reached[np.argmin(away)]))
 
-    def way_apart(self, places: ArrayLike, metres: float) -> NDArray[np.float64] | None:
-        """Return the way (N, 3) to the nearest place that is farther than `metres` from all places (K, 3), by x and y.
-
-        None where it can come to none.
-        """
-        from scipy.spatial import KDTree
-
-        lengths = self._search[0]
-        reached = np.flatnonzero(np.isfinite(lengths))
-        there = self._place(np.column_stack(np.unravel_index(reached, self._room.shape)))
-        others = points_of(places, "places", wanted="(K, 3) metres, x y z").astype(float)
-        if len(others):
-            reached = reached[KDTree(others[:, :2]).query(there[:, :2])[0] > metres]
-        return self._way(int(reached[np.argmin(lengths[reached])])) if len(reached) else None
-
     def _way(self, column: int) -> NDArray[np.float64]:
         """Return the way (N, 3) from the start to a column that is reached."""
         before, columns = self._search[1], [column]

@@ -52,10 +52,11 @@ class Straight:
         end = np.asarray(goal) - np.array([self.short, 0, 0])
         return np.stack([self.start, end]) if self.short <= near else None
 
-    def way_apart(self, places, metres):
-        """Return the way back to x = 0, the only place to look round from, unless it is near the places."""
-        far = all(np.linalg.norm(place[:2]) > metres for place in places)
-        return np.stack([self.start, [0, 0, 1]]) if far else None
+
+def done(mission, ways):
+    """Whether no frontier is a goal: what is left is to look all round."""
+    found = mission.next(None, ways)
+    return found is None or bool(np.isnan(found[1]).all())
 
 
 @pytest.fixture
@@ -69,36 +70,51 @@ def one_frontier(monkeypatch):
 def test_what_was_looked_at_is_done(one_frontier):
     mission = Frontiers()
     assert mission.next(None, Straight(0))[0][-1].tolist() == [5, 0, 1]
+    assert done(mission, Straight(5))
     assert mission.next(None, Straight(5)) is None
     assert mission.left == {"seen from nowhere": 0, "no way to it": 0, "looked at already": 1}
 
 
-def test_where_no_frontier_is_left_it_looks_all_round(one_frontier):
-    one_frontier.clear()
+def test_where_no_frontier_can_be_come_to_it_looks_all_round_from_near_some_but_not_for_ever(one_frontier):
+    hidden = [replace(one_frontier[0], centroid=np.array([x, 0.0, 1]), look_from=None) for x in (9, 9.5, 20, 30, 40)]
+    one_frontier[:] = hidden
     mission = Frontiers()
-    way, look_at = mission.next(None, Straight(4))  # it has turned at x = 4 m
-    assert way[-1].tolist() == [0, 0, 1]
-    assert np.isnan(look_at).all()
-    assert mission.next(None, Straight(0)) is None  # no second time
+    for x in (9, 20, 30):  # the largest first; 9.5 is seen from 9
+        way, look_at = mission.next(None, Straight(0))
+        assert way[-1].tolist() == [x, 0, 1]
+        assert np.isnan(look_at).all()
+    assert mission.next(None, Straight(0)) is None  # three times in vain
+    assert mission.left == {"seen from nowhere": 5, "no way to it": 0, "looked at already": 0}
+
+
+def test_what_a_look_all_round_shows_is_gone_to(one_frontier):
+    seen, mission = list(one_frontier), Frontiers()
+    one_frontier[:] = [replace(seen[0], centroid=np.array([x, 0.0, 1]), look_from=None) for x in (9, 20, 30, 40)]
+    assert [mission.next(None, Straight(0))[0][-1][0] for _ in range(3)] == [9, 20, 30]
+    one_frontier += seen
+    assert mission.next(None, Straight(0))[0][-1][0] == 5
+    one_frontier[:] = one_frontier[:4]
+    assert mission.next(None, Straight(5))[0][-1][0] == 40  # the count of those in vain began anew
 
 
 def test_a_way_that_had_to_be_left_is_tried_again_but_not_for_ever(one_frontier):
     mission = Frontiers()
     for x in (0, 1, 2):
         assert mission.next(None, Straight(x)) is not None
-    assert mission.next(None, Straight(3)) is None
+    assert done(mission, Straight(3))
 
 
 def test_what_was_looked_at_from_far_is_looked_at_from_near(one_frontier):
     mission = Frontiers()
     assert mission.next(None, Straight(0, short=1.5))[0][-1].tolist() == [3.5, 0, 1]
     assert mission.next(None, Straight(3.5))[0][-1].tolist() == [5, 0, 1]
-    assert mission.next(None, Straight(5)) is None
+    assert done(mission, Straight(5))
 
 
 def test_why_frontiers_are_left_is_told(one_frontier):
     one_frontier.append(replace(one_frontier[0], look_from=None))
     mission = Frontiers()
+    assert done(mission, Straight(0, short=3))
     assert mission.next(None, Straight(0, short=3)) is None
     assert mission.left == {"seen from nowhere": 1, "no way to it": 1, "looked at already": 0}
 

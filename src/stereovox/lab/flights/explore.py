@@ -39,8 +39,8 @@ the vehicle nearer, and it looks from there."""
 SEEN_AGAIN, TRIES = 0.6, 3
 """To look at what lies within so many metres of what was looked at, from within as many of there, brings nothing; nor
 does a way to there that had to be left so often."""
-ROUND_M = 1.5
-"""Metres between places from which it looks all round."""
+ROUND_M, ROUNDS = 1.5, 3
+"""Metres between places from which it looks all round, and how often it does so in vain, one after another."""
 UNSEEN, NO_WAY, LOOKED_AT = "seen from nowhere", "no way to it", "looked at already"
 """Why a frontier is left."""
 
@@ -115,12 +115,13 @@ class MiddleOfRoom:
 
 class Frontiers:
     """Explore: go to the frontier that is nearest along the way and look at it; where none can be come to, look all
-    round from places far from where it was looked before, until there is no such place."""
+    round from as near to one as the way leads, the largest first, until that was in vain ROUNDS times."""
 
     def __init__(self, smallest: int = 15, band: float = 0.6):
         self._smallest, self._band = smallest, band
         self._looks: list[tuple[NDArray[np.float64], NDArray[np.float64], bool]] = []
         self._rounds: list[NDArray[np.float64]] = []
+        self._in_vain = 0
         self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -133,7 +134,10 @@ class Frontiers:
         if self._looks:  # the last was looked at only where it came to the end of the way
             place, end, _ = self._looks[-1]
             self._looks[-1] = place, end, bool(np.linalg.norm((ways.start - end)[:2]) < 2 * ARRIVED)
-        best = self._nearest(found, ways, NEAR_M) or self._nearest(found, ways, SHORT_M) or self._round(ways)
+        best = self._nearest(found, ways, NEAR_M) or self._nearest(found, ways, SHORT_M)
+        self._in_vain = 0 if best is not None else self._in_vain + 1
+        if best is None and self._in_vain <= ROUNDS:
+            best = self._round(found, ways)
         if best is None:
             self.left = self._why_left(found, ways)
         else:
@@ -162,13 +166,14 @@ class Frontiers:
                 best = way, one.centroid
         return best
 
-    def _round(self, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the way to the nearest place from which it is worth to look all round."""
-        way = ways.way_apart(self._rounds, ROUND_M)
-        if way is None:
-            return None
-        self._rounds.append(way[-1])
-        return way, np.full(3, np.nan)
+    def _round(self, found: list[Frontier], ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the way to look all round from as near to one of the frontiers as it can come, the largest first."""
+        for one in found:
+            way = ways.way_to(one.centroid, inf)
+            if way is not None and all(np.linalg.norm((way[-1] - place)[:2]) > ROUND_M for place in self._rounds):
+                self._rounds.append(way[-1])
+                return way, np.full(3, np.nan)
+        return None
 
     def _why_left(self, found: list[Frontier], ways: LevelWays) -> dict[str, int]:
         """Count the frontiers that are left, by why none of them is a goal."""

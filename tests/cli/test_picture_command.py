@@ -50,6 +50,18 @@ def test_a_figure_for_a_paper_is_as_wide_as_its_column(saved, tmp_path, view):
     assert b"/Type3" not in (tmp_path / "map.pdf").read_bytes()  # publishers refuse such fonts
 
 
+def test_a_picture_that_is_turned_upright_says_so(saved, tmp_path, capsys):
+    cells = np.argwhere(np.ones((6, 4, 5)))
+    up = (0.0, -np.sin(0.5), np.cos(0.5))
+    one = VoxelMap.from_cells(load_config(voxel_size=0.5, up="+z", up_direction=up), cells, np.full(len(cells), 3.0))
+    one.save(tmp_path / "tilted.svox")
+    page = tmp_path / "map.svg"
+    for words, told in ((["tilted.svox"], True), (["tilted.svox", "--up=z"], False), ([saved.name], False)):
+        assert main(["picture", str(tmp_path / words[0]), str(page), *words[1:]]) == 0
+        assert ("turned upright" in capsys.readouterr().err) == told
+        assert ("turned upright" in page.read_text()) == told
+
+
 def test_a_page_may_be_vectors_and_have_more_dots(saved, tmp_path):
     from PIL import Image
 

@@ -92,8 +92,10 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     arguments.view = arguments.view or "overview"
     _check_options(arguments)
     voxel_map = open_cubes(arguments.map)
-    if arguments.up is None:
+    if arguments.up is None and voxel_map.config.up_direction is not None:
         voxel_map = levelled(voxel_map)
+        heading = heading if arguments.title else f"{heading}, turned upright"
+        say("note: turned upright for the picture: its axes and numbers of cells are not those of the map itself")
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     if arguments.width_mm is None:

@@ -102,7 +102,7 @@ def stamped_lines(path: Path) -> list[StampedLine]:
     try:
         text = read_text(path, MAX_LIST, "replace")
     except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+        raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
 
 

@@ -25,7 +25,7 @@ def result():
 def test_rows_match_their_heads(result):
     told = dict(zip(HEADS, rows_of(result)[0], strict=True))
     assert (told["flights"], told["collisions"], told["ended by itself"]) == ("2", "1", "1")
-    assert (told["air known: median"], told["50 % after, s"], told["80 %"]) == ("51.0%", "20", "-")
+    assert (told["air known: median"], told["50 % known after, s"], told["80 % known after, s"]) == ("51.0%", "20", "-")
 
 
 def test_the_page_and_its_files(result, tmp_path):

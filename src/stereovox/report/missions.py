@@ -12,8 +12,8 @@ from stereovox.report import page
 from stereovox.view.coverage import coverage_png
 
 HEADS = ("scene", "flights", "collisions", "ended by itself", "metres", "goals", "least clearance, m",
-         "air known: median", "least", "50 % after, s", "80 %", "frontiers left", "room at the end, m",
-         "most there is")  # fmt: skip
+         "air known: median", "air known: least", "50 % known after, s", "80 % known after, s", "frontiers left",
+         "room at the end, m", "most room there is, m")  # fmt: skip
 FLIGHT_HEADS = ("scene", "seed", "collided, s", "seconds", "ended by itself", "metres", "goals", "clearance, m",
                 "air known", "frontiers left", "room, m")  # fmt: skip
 MISSIONS = {

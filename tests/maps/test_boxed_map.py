@@ -280,3 +280,10 @@ def test_other_things_are_not_replaced(tmp_path):
     assert (tmp_path / "notes/a.txt").read_text() == "mine"
     with pytest.raises(StereovoxError, match="boxes of 100 m"):
         sv.save_boxed(flight(), tmp_path / "new", 100)
+
+
+def test_a_map_in_one_piece_is_not_saved_below_a_folder_that_is_called_as_a_store(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MapFileError, match=r"s3://bucket/m\.svox: only a map in boxes can lie in an object store"):
+        flight().save("s3://bucket/m.svox")
+    assert not list(tmp_path.iterdir())

@@ -121,6 +121,8 @@ def check_target(folder: Path) -> None:
     """Raise MapFileError when a map cannot be saved to `folder`: it holds something else or cannot be written."""
     if "\0" in str(folder):
         raise MapFileError(f"{str(folder)!r}: no file name holds the character 0; choose another name")
+    if is_url(url := str(folder).replace(":/", "://", 1)):  # a path has one slash where a URL has two
+        raise MapFileError(f"{url}: only a map in boxes can lie in an object store (fleet, save_boxed); name a folder")
     try:
         there = folder.exists()
     except OSError as error:  # a name that is too long, a folder that may not be entered

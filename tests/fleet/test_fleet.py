@@ -555,6 +555,8 @@ def test_keys_know_what_objects_hold_and_only_their_own(s3):
     assert fingerprint(drive) == before
     place.write("drive1/a.txt", b"2")
     assert fingerprint(drive) != before
+    with pytest.raises(MapFileError, match=f"{s3}: is a bucket; name a recording in it"):
+        fingerprint(s3)
     place.write("one.bag", b"1")
     assert [name for name, _ in fingerprint(f"{above}/one.bag")] == ["one.bag"]
 

@@ -312,6 +312,8 @@ def local(where: str, folder: Path) -> str:
 def _stored(where: str) -> tuple[Bucket, dict[str, list[Any]]]:
     """Return the place above a recording in an object store, and what `Bucket.versions` says of its files."""
     above, _, name = where.rstrip("/").rpartition("/")
+    if above.endswith(":/"):
+        raise MapFileError(f"{where}: is a bucket; name a recording in it, {where.rstrip('/')}/NAME")
     place = Bucket(above)
     found = place.versions(f"{name}/")
     return place, found or {file: one for file, one in place.versions(name).items() if file == name}

@@ -119,6 +119,23 @@ def test_a_robots_log_and_simulations():
     assert sv.describe("sim:wall?image_width=160").kind == "recording"
 
 
+def test_a_folder_with_one_file_that_needs_no_others_is_that_file(tmp_path):
+    filled(tmp_path / "notes.txt", b"once upon a time")
+    write_floor(tmp_path / "f.yaml")
+    assert sv.describe(tmp_path) == sv.describe(tmp_path / "f.yaml")
+    assert sv.describe(tmp_path).kind == "floor map"
+    write_floor(tmp_path / "g.yaml")
+    with pytest.raises(StereovoxError, match=f"no recording, but 2 files; see each: stereovox info {tmp_path}/f.yaml"):
+        sv.describe(tmp_path)
+
+
+def test_a_folder_that_may_be_a_recording_says_what_is_missing(recording):
+    write_floor(recording / "floor.yaml")
+    (recording / "camera-intrinsics.txt").unlink()
+    with pytest.raises(StereovoxError, match="camera-intrinsics"):
+        sv.describe(recording)
+
+
 @pytest.mark.parametrize(
     "make",
     [
@@ -142,6 +159,15 @@ def test_what_is_nothing_ends_in_one_line_with_a_cure(tmp_path, make):
     assert str(path) in text
     assert len(text.replace(str(tmp_path), "")) <= 300
     assert f"stereovox info {path}" not in text, "that is what was just typed"
+
+
+def write_floor(path):
+    """Write a floor's map of 4 x 3 cells for map_server."""
+    path.with_suffix(".pgm").write_bytes(b"P5\n4 3\n255\n" + bytes([0, 205, 254, 254] * 3))
+    path.write_text(
+        f"image: {path.stem}.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
 
 
 def filled(path, content):

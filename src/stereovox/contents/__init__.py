@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from stereovox.contents.description import Description as Description
@@ -22,6 +23,8 @@ KINDS = (
     "stereovox.contents.files:describe_points",
 )
 """Asked in this order; each returns None for what is not of its kind."""
+BY_THEMSELVES, MOST_FILES = 4, 50
+"""How many of them, from the first on, are of files that need no others; and files of a folder that are looked at."""
 UNKNOWN = "is of no known kind, by name or content; what can be read: docs/recordings.md and docs/formats.md"
 
 
@@ -41,13 +44,44 @@ def describe(path: str | os.PathLike[str]) -> Description:
     from stereovox.opening import file_cure, open_source
 
     text = os.fspath(path)
-    for name in KINDS:
+    found = _known(text, KINDS)
+    if found is not None:
+        return found
+    if os.path.isfile(text):
+        raise SourceError(f"{shortened(text)}: {file_cure(text) or UNKNOWN}")
+    try:
+        open_source(text)  # which says what is missing
+    except SourceError:
+        found = _within(text)
+        if found is None:
+            raise
+        return found
+    raise AssertionError(f"{text}: a recording that is not described")
+
+
+def _known(text: str, kinds: Sequence[str]) -> Description | None:
+    """Return what a path holds if that is of one of these kinds."""
+    for name in kinds:
         module, _, function = name.partition(":")
         known: Callable[[str], Description | None] = getattr(import_module(module), function)
         found = known(text)
         if found is not None:
             return found
-    if os.path.isfile(text):
-        raise SourceError(f"{shortened(text)}: {file_cure(text) or UNKNOWN}")
-    open_source(text)  # which says what is missing
-    raise AssertionError(f"{text}: a recording that is not described")
+    return None
+
+
+def _within(folder: str) -> Description | None:
+    """Return what the one file of a folder holds that commands use by itself; raises SourceError for several."""
+    if not os.path.isdir(folder) or any(entry.is_dir() for entry in os.scandir(folder)):
+        return None
+    files = sorted(entry.path for entry in os.scandir(folder) if entry.is_file() and not _is_image(entry.name))
+    found = {file: one for file in files[:MOST_FILES] if (one := _known(file, KINDS[:BY_THEMSELVES])) is not None}
+    if len(found) > 1:
+        see = f"stereovox info {shlex.quote(next(iter(found)))}"
+        raise SourceError(f"{shortened(folder)}: no recording, but {len(found)} files; see each: {see}")
+    return next(iter(found.values()), None)
+
+
+def _is_image(name: str) -> bool:
+    """Return whether a file may be the image of a floor's map, which is described by the other file of it."""
+    return name.lower().endswith((".pgm", ".png", ".bmp"))

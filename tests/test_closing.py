@@ -161,6 +161,13 @@ def test_what_the_closed_map_is_made_of_is_said(closure, capsys):
     assert "only 30 frames were kept (map.frames_budget)" in "".join(capsys.readouterr())
 
 
+def test_that_places_alike_may_be_mistaken_is_said_where_poses_were_far_off(closure, capsys):
+    (loop, *_) = closure.loops
+    for off_m, said in ((1.0, False), (4.0, True)):
+        say_closure(replace(closure, loops=[replace(loop, off_m=off_m)]))
+        assert ("may be taken for one another" in "".join(capsys.readouterr())) == said
+
+
 def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tmp_path):
     mapper.save(tmp_path / "a.svox")
     closed = sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", **{"loops.drift": 0.05})

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from stereovox.closing import ClosedMap, LoopClosure
 
 EXAMPLE = "stereovox loops kitchen.svox"
-SHOWN = 5
-"""Refused places that are listed."""
+SHOWN, FAR_M = 5, 1.5
+"""Refused places that are listed; and how far off poses may be before it is said what may be wrong."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -85,6 +85,8 @@ def say_closure(closure: LoopClosure) -> None:
     if closure.loops:
         off = summary["off_m"]["max"]
         say(f"{len(closure.loops)} loops closed; there the poses were off by up to {off:.2f} m")
+        if off > FAR_M:
+            say("note: places that look alike and lie no farther apart may be taken for one another; look at the map")
     else:
         say(f"no loops were found: of {len(closure.places)} places, none is surely seen twice")
     if closure.odometry is not None:

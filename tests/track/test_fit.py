@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.se3 import inverse, rotation_matrix, rotation_vector
-from stereovox.track.fit import Stage, settled
+from stereovox.track.fit import Stage, both, holding, settled
 
 
 def pose(turn, shift):
@@ -133,3 +133,29 @@ def test_large_turns_are_found_as_the_closed_form_finds_them():
     assert T[:3, :3] == pytest.approx(R, abs=1e-7)
     assert T[:3, 3] == pytest.approx(there.mean(0) - R @ here.mean(0), abs=1e-7)
     assert inverse(truth) @ T == pytest.approx(np.eye(4), abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_holds_nothing_takes_nothing_away_from_what_does(seed):
+    """A wall holds three directions, and of the others less than nothing once what noise feigns is taken off."""
+    random, doubt = np.random.default_rng(seed), spread(seed)
+    A = 20_000 * random.standard_normal((3, 6))
+    wall = linear(A, np.zeros(3)).equations
+    feigned = lambda T: (wall(T)[0] - 3e7 * np.eye(6), wall(T)[1])  # noqa: E731
+    B, b = 900 * random.standard_normal((20, 6)), 10 * random.standard_normal(20)
+    seen = linear(B, b)
+    alone = settled([seen], EXPECTED, doubt)[1]
+    T, covariance = settled([Stage(both(holding(feigned, doubt), seen.equations), 1e-12)], EXPECTED, doubt)
+    assert np.linalg.eigvalsh(alone - covariance).min() > -1e-12  # more is known, in no direction less
+    assert np.trace(covariance) < 0.9 * np.trace(alone)
+    without = settled([Stage(both(feigned, seen.equations), 1e-12)], EXPECTED, doubt)[1]
+    assert np.trace(without) > 2 * np.trace(alone)  # the control: as it would be
+    assert np.linalg.norm(off(T)) < 0.05
+
+
+def test_what_holds_all_is_held_as_it_is():
+    random, doubt = np.random.default_rng(0), spread(0)
+    one = linear(2000 * random.standard_normal((20, 6)), 10 * random.standard_normal(20)).equations
+    T = pose([0.3, -1.2, 0.79], [2.0, -3.01, 1.0])
+    for found, wanted in zip(holding(one, doubt)(T), one(T), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())

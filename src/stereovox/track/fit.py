@@ -70,6 +70,23 @@ def both(one: Equations, other: Equations) -> Equations:
     return together
 
 
+def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
+    """Return equations without the directions that they do not hold, to be added to others.
+
+    There information that is less what noise feigns may be below 0: alone it holds nothing, and it must not take away
+    what other evidence holds. doubt: as that of `settled`.
+    """
+    scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
+
+    def held(T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        information, gradient = equations(T)
+        much, directions = _held(information, scale)
+        across = np.linalg.inv(directions)  # its rows are the parts of a motion along the directions
+        return across.T @ (much[:, None] * across), across.T @ np.where(much > 0, directions.T @ gradient, 0.0)
+
+    return held
+
+
 def settled(
     stages: Iterable[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
 ) -> tuple[Transform, NDArray[np.float64]]:

@@ -17,7 +17,7 @@ from stereovox.frame import AnyFrame, Frame
 from stereovox.integrate.views import PerCamera
 from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
-from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, settled
+from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, settled
 from stereovox.track.photos import Beside, Photos, Sighted
 from stereovox.track.surfels import CONVERGED, Patches, SurfelMap, patches_of
 from stereovox.track.views import View, contradiction, is_new, stood_free, unlike, view_of
@@ -126,7 +126,7 @@ class Surfaces:
         moved = not contrary(T, seen.T_map_camera, covariance + seen.covariance + beside.lag)
         if held and apart and (moved or len(beside.found) < STRONG or not self._photos.trusted()):
             return alone
-        together = [Stage(both(level, beside.equations()), CONVERGED * level.size) for level in levels]
+        together = [Stage(both(holding(level, doubt), beside.equations()), CONVERGED * level.size) for level in levels]
         if held and not apart:
             self._photos.agree(T)
             T, covariance = settled(together[-1:], expected, doubt, T)

@@ -12,6 +12,7 @@ from made_tracks import CAMERA, LENS, PHOTO_CAMERA, T_DEPTH_PHOTO, aside, covere
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
+from stereovox.opening import open_source
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, cylinder
 from stereovox.track.photos import Beside, inverse_depths
@@ -89,6 +90,16 @@ def test_before_a_wall_with_a_pattern_poses_are_right_and_errors_as_their_covari
     assert np.all(found.errors() < (METRES, DEGREES))
     assert 0.02 < np.mean(found.nees()) < 2
     assert track([replace(frame, photo=None) for frame in frames]).tracked == []  # the image does it
+
+
+def test_where_depth_leaves_the_pose_open_pictures_hold_it():
+    """Along walls of an apartment: what depth holds less than nothing of must not be taken off what pictures hold."""
+    frames = list(open_source("sim:apartment?image_width=212&photo=0.3", "225:285"))
+    tracker = Tracker(start=frames[0].T_world_sensor)
+    found = [tracker.add(frame) for frame in frames]
+    assert [i for i, one in enumerate(found) if one.lost] == [0]
+    for frame, one in zip(frames, found, strict=True):
+        assert np.linalg.norm(one.T_world_sensor[:3, 3] - frame.T_world_sensor[:3, 3]) < 0.03
 
 
 def test_before_a_bare_wall_images_of_noise_hold_nothing():

@@ -127,11 +127,13 @@ class Surfaces:
         if held and apart and (moved or len(beside.found) < STRONG or not self._photos.trusted()):
             return alone
         together = [Stage(both(holding(level, doubt), beside.equations()), CONVERGED * level.size) for level in levels]
-        if held and not apart:
+        if held and apart:
+            T, covariance = settled(together, expected, doubt, seen.T_map_camera)
+        elif held:
             self._photos.agree(T)
             T, covariance = settled(together[-1:], expected, doubt, T)
-        else:
-            T, covariance = settled(together, expected, doubt, seen.T_map_camera)
+        else:  # the landmarks are right to a part of the finest surfels; coarse ones could only contradict them
+            T, covariance = settled(together[-1:], expected, doubt, seen.T_map_camera)
         return Fit(T, covariance, levels[-1].known, min(levels[-1].usual, LENIENT * beside.usual(T)))
 
     def _lasting(self, patches: Patches, T: Transform) -> Patches:

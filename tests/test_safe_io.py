@@ -3,13 +3,17 @@
 
 import os
 import time
+from pathlib import Path
 
 import pytest
 
 from stereovox.cli.terminal import say
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused, MissingExtra, SourceError, StereovoxError
-from stereovox.safe_io import json_value, read_bounded, read_text, shown, toml_table, yaml_value
+from stereovox.report.folder import out_folder
+from stereovox.report.page import write_page
+from stereovox.safe_io import check_file, json_value, read_bounded, read_text, replacing, shown, toml_table, yaml_value
+from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.camera_file import read_camera
 from stereovox.sources.tracker import read_tracker
 
@@ -136,3 +140,20 @@ def test_times_beyond_all_bounds(tmp_path, stamp):
 def test_notes_cannot_write_to_the_terminal(capsys):
     say("note: a topic /a\x1b[2J\x07b\nsecond line é")
     assert capsys.readouterr().err == "note: a topic /a\\x1b[2J\\x07b\nsecond line é\n"
+
+
+def test_a_url_is_no_name_of_a_single_file(tmp_path, monkeypatch):
+    """Also as a path, which has one slash where the URL has two, and where a folder of this name is there."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s3:/bucket").mkdir(parents=True)
+    for name in ("s3://bucket/p.png", Path("s3://bucket/p.png")):
+        with pytest.raises(StereovoxError, match=r"^s3://bucket/p\.png: only maps in boxes"):
+            check_file(name, [".png"])
+        with pytest.raises(SourceError, match=r"^s3://bucket/p\.png: only maps in boxes"), replacing(name, SourceError):
+            pass
+    for folder in (out_folder, lambda name: write_page(name, "page.html", "")):
+        with pytest.raises(StereovoxError, match=r"^s3://bucket/new: only maps in boxes"):
+            folder("s3://bucket/new")
+    with pytest.raises(SourceError, match=r"^s3://bucket/a\.bag: only maps in boxes"):
+        BagWriter(Path("s3://bucket/a.bag"))
+    assert not list((tmp_path / "s3:/bucket").iterdir())

@@ -8,7 +8,6 @@ credentials from the usual variables: AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID, AWS_R
 from __future__ import annotations
 
 import os
-import re
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -20,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import MapFileError, MissingExtra
+from stereovox.safe_io import is_url as is_url
 from stereovox.safe_io import read_bounded, sync_folder
 
-URL = re.compile(r"(s3|s3a|gs|az|abfs|abfss)://.+", re.DOTALL)
-"""Names of places in object stores."""
 UNFINISHED = ".unfinished-"
 """Begins the names of files in a folder that are not yet whole; nobody lists them."""
 MAX_FILE = 1 << 32
@@ -31,11 +29,6 @@ MAX_FILE = 1 << 32
 AT_ONCE = 8
 """Objects that are put or read at the same time."""
 RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
-
-
-def is_url(where: str | os.PathLike[str]) -> bool:
-    """Tell whether a name is that of a place in an object store."""
-    return bool(URL.fullmatch(os.fspath(where)))
 
 
 class Place(ABC):

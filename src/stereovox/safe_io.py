@@ -44,6 +44,8 @@ MAX_DOTS = 200
 MAX_DEPTH = 64
 """Deepest nesting of brackets in YAML."""
 BRACKETS = re.compile(r"[\[\]{}]")
+URL = re.compile(r"(s3|s3a|gs|az|abfs|abfss)://.+", re.DOTALL)
+"""Names of places in object stores."""
 MAX_COUNT = 1 << 62
 """Counts in files are smaller."""
 MAX_NODES = 100_000
@@ -60,8 +62,20 @@ def check_in_space(out: str | Path) -> None:
         raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
 
 
+def is_url(where: str | os.PathLike[str]) -> bool:
+    """Tell whether a name is that of a place in an object store."""
+    return bool(URL.fullmatch(os.fspath(where)))
+
+
+def check_local(out: str | Path, error: type[StereovoxError] = StereovoxError) -> None:
+    """Raise `error` where a file or folder that can only be local is named as a URL, also by a path made of one."""
+    if is_url(url := str(Path(out)).replace(":/", "://", 1)):  # a path has one slash where a URL has two
+        raise error(f"{url}: only maps in boxes can lie in an object store (fleet); choose a local name")
+
+
 def check_file(out: str | Path, endings: Iterable[str]) -> Path:
     """Return `out` as a path. Raises StereovoxError, before any work, where it cannot be written."""
+    check_local(out)
     path = Path(out)
     if path.suffix.lower() not in endings:
         raise StereovoxError(f"{out}: give a name that ends in {' or '.join(endings)}")
@@ -83,8 +97,9 @@ def check_folder(folder: Path, name: str) -> None:
 def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> Iterator[IO[bytes]]:
     """Yield a binary file that replaces `path` when the block ends without error; otherwise `path` is unchanged.
 
-    Raises `error` where the folder is missing or cannot be written, or the disk is full.
+    Raises `error` where the folder is missing or cannot be written, the disk is full, or the name is a URL.
     """
+    check_local(path, error)
     target = Path(os.path.realpath(path))  # a symbolic link stays one
     temporary = target.with_name(f".{short_name(target)}.{uuid.uuid4().hex[:12]}.new")
     try:

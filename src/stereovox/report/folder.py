@@ -6,10 +6,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from stereovox.errors import StereovoxError
+from stereovox.safe_io import check_local
 
 
 def out_folder(out: str | Path) -> Path:
     """Return the folder `out`, created if missing; raises StereovoxError, one line, where that fails."""
+    check_local(out)
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)

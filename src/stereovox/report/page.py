@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.safe_io import replacing
+from stereovox.safe_io import check_local, replacing
 
 MANY = 7
 """Largest number of columns that fit a page in large letters."""
@@ -39,6 +39,7 @@ def write_files(folder: str | Path, contents: dict[str, bytes]) -> Path:
 
     Raises StereovoxError, one line, where one cannot be written.
     """
+    check_local(folder)
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.safe_io import read_text, replacing, yaml_value
+from stereovox.safe_io import check_local, read_text, replacing, yaml_value
 
 OURS, LAUNCH, RESULT = "nav2.yaml", "nav2.launch.py", "nav2_params.yaml"
 """Our parameters, the launch file, and the file that is made for Nav2."""
@@ -40,6 +40,7 @@ def write_nav2(folder: str | Path, params: str | Path | None = None) -> list[Pat
     written = {RESULT: yaml.safe_dump(merged, sort_keys=False).encode()}
     written |= {name: _shared(name) for name in COPIED}
     paths = [Path(folder) / name for name in written]
+    check_local(folder)
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -19,7 +19,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.safe_io import short_name, sync_file, sync_folder, sync_tree
+from stereovox.safe_io import check_local, short_name, sync_file, sync_folder, sync_tree
 from stereovox.se2 import lifted
 from stereovox.se3 import Transform, rigidity_error
 from stereovox.sources.bags.depth_topic import sibling
@@ -261,6 +261,7 @@ class BagFileWriter:
     """
 
     def __init__(self, path: Path, packed: bool = True):
+        check_local(path, SourceError)
         self.path = path
         self._packed = packed
         self._ending = path.suffix.lower()

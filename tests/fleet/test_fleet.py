@@ -27,7 +27,7 @@ import stereovox as sv
 from made_clouds import room_cloud
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
-from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, recordings, recordings_of
+from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, plan_fleet, recordings, recordings_of
 from stereovox.fleet.recordings import boxes_with, fingerprint, local
 from stereovox.maps import pyramid
 from stereovox.maps.boxes import BoxLayout
@@ -383,6 +383,22 @@ def test_recordings_of_an_object_store(mapped, s3, tmp_path):
     stored = mapped([f"{place}/{folder.name}"], tmp_path / "n.svox")
     assert_same(stored.map.storage.blocks(), local.map.storage.blocks())
     assert stored.map.frames == 12
+
+
+def test_a_plan_looks_where_the_run_reads(s3, tmp_path):
+    """Also into object stores, and at files of poses; what cannot be read is a doubt."""
+    folder, above = Path(recording(1)), f"{s3}/{uuid4().hex}"
+    for file in filter(Path.is_file, folder.rglob("*")):
+        Place.of(above).write(f"drive/{file.relative_to(folder)}", file.read_bytes())
+    stored, here = (plan_fleet([one], **SETTINGS) for one in (f"{above}/drive", folder))
+    assert (stored.frames, stored.boxes, stored.bytes) == (here.frames, here.boxes, here.bytes)
+    assert "doubts" not in stored.summary()
+    unposed = Recording(recording(2), str(tmp_path / "gone.tum"))
+    plan = plan_fleet([folder, unposed, f"{above}/gone"], **SETTINGS)
+    assert plan.frames == here.frames
+    assert [re.sub(r".*gone", "gone", line) for line in plan.summary()["doubts"]] == [
+        "gone.tum: No such file or directory; give a file you may read", "gone: no such recording in the store; check the name"
+    ]  # fmt: skip
 
 
 def test_killed_workers_change_nothing(tmp_path):

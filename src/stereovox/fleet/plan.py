@@ -6,18 +6,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from stereovox.config import Config, load_config
-from stereovox.errors import StereovoxError, without_name
+from stereovox.errors import StereovoxError
 from stereovox.fleet.fleet import box_side, settings_for
-from stereovox.fleet.recordings import Recording, Recordings, boxes_with, recordings_of
+from stereovox.fleet.recordings import Recording, Recordings, boxes_with, local, recordings_of, why_not
 from stereovox.mapper import Mapper
 from stereovox.maps.boxes import BoxLayout
 from stereovox.opening import open_source
+from stereovox.sources.trajectory import Trajectory
 
 LOOKED_AT = 24
 """Frames of a recording that are looked at, spread over it; the first of all compiles and does not count."""
@@ -35,7 +37,7 @@ class FleetPlan:
         overlap: In how many boxes a frame is, on the average.
         bytes: Of the depth images that are kept for adding and correcting recordings later.
         core_hours: Hours of a core like one of this machine.
-        unreadable: Recordings that cannot be read, and why.
+        unreadable: Recordings that cannot be read, or whose file of poses cannot, and why.
     """
 
     recordings: int
@@ -49,7 +51,8 @@ class FleetPlan:
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox fleet --plan --json`."""
-        return {**asdict(self), "frames_read": round(self.frames * self.overlap)}
+        doubts = {"doubts": list(self.unreadable)} if self.unreadable else {}
+        return {**asdict(self), "frames_read": round(self.frames * self.overlap), **doubts}
 
 
 def plan_fleet(
@@ -63,7 +66,7 @@ def plan_fleet(
     """Estimate what `map_fleet` will cost.
 
     Args:
-        recordings: As for `map_fleet`; those in object stores cannot be looked at.
+        recordings: As for `map_fleet`; those in object stores are copied, one at a time, to be looked at.
         profile: As for `map_fleet`.
         box_m: As for `map_fleet`.
         progress: Called with recordings done, their number, and the current activity.
@@ -81,14 +84,14 @@ def plan_fleet(
     frames = stored = 0
     seconds, seen, unreadable = 0.0, [], []
     for n, one in enumerate(listed, 1):
-        try:
-            length, rows, each_s, each_bytes = _looked_at(one, layout)
-        except StereovoxError as error:
-            why = without_name(error, one.where)
-            unreadable.append(f"{one.where}: {why}")
-            continue
-        finally:
-            progress(n, len(listed), "looking at recordings")
+        with TemporaryDirectory(prefix="stereovox-") as folder:
+            try:
+                length, rows, each_s, each_bytes = _looked_at(one, layout, Path(folder))
+            except Exception as error:
+                unreadable.append(f"{one.where}: {why_not(one.where, error, Path(folder))}")
+                continue
+            finally:
+                progress(n, len(listed), "looking at recordings")
         frames, stored, seconds = frames + length, stored + length * each_bytes, seconds + length * each_s
         seen.append((one.where, rows, length))
     if not seen:
@@ -100,9 +103,11 @@ def plan_fleet(
     return FleetPlan(len(seen), frames, side_m, len(boxes), overlap, round(stored), hours, tuple(unreadable))
 
 
-def _looked_at(recording: Recording, layout: BoxLayout) -> tuple[int, np.ndarray, float, float]:
+def _looked_at(recording: Recording, layout: BoxLayout, folder: Path) -> tuple[int, np.ndarray, float, float]:
     """Return the number of frames, boxes that some see (as `boxes_seen`), and seconds and bytes of one frame."""
-    source = open_source(recording.where)
+    if recording.poses is not None:
+        Trajectory(Path(local(recording.poses, folder / "poses")))  # raises where the run could not read it
+    source = open_source(local(recording.where, folder / "recording"))
     step = max(1, len(source) // LOOKED_AT)
     mapper = Mapper(load_config(layout.config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
     times, seen = [], []

@@ -31,6 +31,10 @@ AT_ONCE = 8
 RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
 
 
+class NoBucketError(MapFileError):
+    """An object store has no bucket of this name."""
+
+
 class Place(ABC):
     """Files by their names, with `/` between the parts of a name.
 
@@ -301,9 +305,9 @@ class Bucket(Place):
         except (known.PermissionDeniedError, known.UnauthenticatedError):
             cure = "the store does not allow it; check the credentials (AWS_ACCESS_KEY_ID and so on)"
             raise MapFileError(f"{self}/{name}: {cure}") from None
-        except FileNotFoundError:
-            raise MapFileError(f"{self}: there is no such bucket; check the name, or make it") from None
         except (known.BaseError, OSError) as error:
+            if isinstance(error, FileNotFoundError) or "NoSuchBucket" in str(error):  # as a list of objects says it
+                raise NoBucketError(f"{self}: there is no such bucket; check the name, or make it") from None
             reason = str(error).partition("\n")[0].strip()[:200]
             raise MapFileError(
                 f"{self}/{name}: the store cannot be used ({reason}); check AWS_ENDPOINT_URL, keys and the network"

@@ -383,6 +383,23 @@ def test_recordings_of_an_object_store(mapped, s3, tmp_path):
     stored = mapped([f"{place}/{folder.name}"], tmp_path / "n.svox")
     assert_same(stored.map.storage.blocks(), local.map.storage.blocks())
     assert stored.map.frames == 12
+    again = mapped([f"{place}/{folder.name}/"], tmp_path / "n.svox", resume=True)
+    assert (again.recordings[0].seconds, again.boxes[1]) == (0, 0)  # it is the same one
+
+
+def test_what_cannot_be_used_of_an_object_store_is_named_as_there(mapped, s3, tmp_path):
+    """Many recordings in place of one, poses that are none, and a bucket that is not there."""
+    above = f"{s3}/{uuid4().hex}"
+    for file in filter(Path.is_file, Path(recording(1)).rglob("*")):
+        Place.of(above).write(f"city/drive/{file.relative_to(recording(1))}", file.read_bytes())
+    Place.of(above).write("new.tum", b"")
+    wrong = [f"{above}/city", Recording(f"{above}/city/drive", f"{above}/new.tum"), "s3://no-such-bucket/drive"]
+    made = mapped([recording(2), *wrong], tmp_path / "m.svox")
+    said = [one.error for one in made.recordings]
+    assert said[:2] == ["", f"no recording itself; did you mean {above}/city/drive?"]
+    assert said[2].startswith(f"{above}/new.tum: holds no pose")
+    assert said[3] == "s3://no-such-bucket: there is no such bucket; check the name, or make it"
+    assert all(f"{above}/city/drive/camera.toml" in one.notes[0] for one in made.recordings[2:3])
 
 
 def test_a_plan_looks_where_the_run_reads(s3, tmp_path):
@@ -397,7 +414,8 @@ def test_a_plan_looks_where_the_run_reads(s3, tmp_path):
     plan = plan_fleet([folder, unposed, f"{above}/gone"], **SETTINGS)
     assert plan.frames == here.frames
     assert [re.sub(r".*gone", "gone", line) for line in plan.summary()["doubts"]] == [
-        "gone.tum: No such file or directory; give a file you may read", "gone: no such recording in the store; check the name"
+        "gone.tum: No such file or directory; give a file you may read",
+        "gone: no such recording in the store; check the name",
     ]  # fmt: skip
 
 

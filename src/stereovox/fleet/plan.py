@@ -15,7 +15,7 @@ import numpy as np
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
 from stereovox.fleet.fleet import box_side, settings_for
-from stereovox.fleet.recordings import Recording, Recordings, boxes_with, local, recordings_of, why_not
+from stereovox.fleet.recordings import COPY, POSES, Recording, Recordings, boxes_with, local, recordings_of, why_not
 from stereovox.mapper import Mapper
 from stereovox.maps.boxes import BoxLayout
 from stereovox.opening import open_source
@@ -88,7 +88,7 @@ def plan_fleet(
             try:
                 length, rows, each_s, each_bytes = _looked_at(one, layout, Path(folder))
             except Exception as error:
-                unreadable.append(f"{one.where}: {why_not(one.where, error, Path(folder))}")
+                unreadable.append(f"{one.where}: {why_not(one, error, Path(folder))}")
                 continue
             finally:
                 progress(n, len(listed), "looking at recordings")
@@ -106,8 +106,8 @@ def plan_fleet(
 def _looked_at(recording: Recording, layout: BoxLayout, folder: Path) -> tuple[int, np.ndarray, float, float]:
     """Return the number of frames, boxes that some see (as `boxes_seen`), and seconds and bytes of one frame."""
     if recording.poses is not None:
-        Trajectory(Path(local(recording.poses, folder / "poses")))  # raises where the run could not read it
-    source = open_source(local(recording.where, folder / "recording"))
+        Trajectory(Path(local(recording.poses, folder / POSES)))  # raises where the run could not read it
+    source = open_source(local(recording.where, folder / COPY))
     step = max(1, len(source) // LOOKED_AT)
     mapper = Mapper(load_config(layout.config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
     times, seen = [], []

@@ -16,7 +16,7 @@ import os
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError, StereovoxError, one_line, without_name
+from stereovox.errors import MapFileError, StereovoxError, one_line
 from stereovox.frame import Cloud, Frame
 from stereovox.maps import VoxelMap
 from stereovox.maps.boxes import BoxLayout
@@ -35,7 +35,7 @@ from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
 from stereovox.maps.kept_frames import KeptFrame, digest_of
 from stereovox.maps.store import MANIFEST, MAX_MANIFEST, is_map
 from stereovox.opening import is_recording
-from stereovox.places import Bucket, Folder, Place, is_url
+from stereovox.places import Bucket, Folder, NoBucketError, Place, is_url
 from stereovox.pose_choice import GIVEN
 from stereovox.remapping import remap
 from stereovox.run import MapRun
@@ -48,6 +48,8 @@ RECORDINGS = "recordings"
 SETTINGS = "fleet.json"
 """The settings that a place's recordings are mapped with, written once there are workers, before anything else."""
 SEEN, REPORT = "seen.npy", "report.json"
+COPY, POSES = "recording", "poses"
+"""Folders into which a recording of an object store, and the file of its poses, are copied."""
 TEXTS = (".txt", ".md", ".csv", ".json", ".yaml", ".yml", ".toml", ".log")
 """Endings of files that lie beside recordings and hold text."""
 MAX_REPORT = 1 << 24
@@ -120,6 +122,7 @@ def recordings_of(names: Recordings) -> list[Recording]:
     found: list[Recording] = []
     for name in [names] if isinstance(names, (str, Path, Recording)) else names:
         found += [name] if isinstance(name, Recording) else _expanded(str(name))
+    found = [replace(one, where=_bare(one.where)) for one in found]
     if not found:
         raise StereovoxError("no recording is named; give one or more")
     known: dict[str, str] = {}
@@ -144,7 +147,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
         try:
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
         except Exception as error:
-            return RecordingReport(recording.where, error=why_not(recording.where, error, Path(folder)), notes=notes)
+            return RecordingReport(recording.where, error=why_not(recording, error, Path(folder)), notes=notes)
         manifest = json_value((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
             home.write(name, (made / name).read_bytes())
@@ -160,7 +163,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     return report
 
 
-def why_not(where: str, error: Exception, folder: Path) -> str:
+def why_not(recording: Recording, error: Exception, folder: Path) -> str:
     """Return in one line why a recording cannot be used, also where what reads it failed in a way nobody foresaw.
 
     Raises the error itself where it is not the recording's: in `folder`, for its copy and its map, is no room.
@@ -170,12 +173,22 @@ def why_not(where: str, error: Exception, folder: Path) -> str:
     if isinstance(error, OSError):
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise error
-        return f"{error.filename or where}: {error.strerror or error}; check that you may read it"
+        what = _named(str(error.filename or recording.where), recording, folder)
+        return f"{what}: {error.strerror or error}; check that you may read it"
     if isinstance(error, MapFileError) and str(folder) in str(error):
         raise error
     if not isinstance(error, StereovoxError):
-        return one_line(f"it cannot be read ({type(error).__name__}: {error}); is it damaged?")
-    return without_name(error, where)
+        why = one_line(f"it cannot be read ({type(error).__name__}: {error}); is it damaged?")
+        return _named(why, recording, folder)
+    return _named(str(error), recording, folder).removeprefix(f"{recording.where}: ")
+
+
+def _named(text: str, recording: Recording, folder: Path) -> str:
+    """Return a text with names in an object store in place of those of the copies in `folder`."""
+    for copy, where in ((COPY, recording.where), (POSES, recording.poses)):
+        if where is not None and is_url(where):
+            text = text.replace(str(folder / copy), where.rpartition("/")[0])
+    return text
 
 
 def report_of(place: Place, key: str) -> RecordingReport | None:
@@ -241,14 +254,18 @@ def _mapped_alone(
 ) -> tuple[Path, list[NDArray[np.int64]]]:
     """Return the folder of the map of a recording, which kept its frames, and the boxes (n, 3) that each sees."""
     keeping, told = load_config(layout.config, **{"map.keep_frames": True}), list[NDArray[np.int64]]()
-    source = local(recording.where, folder / "recording")
+    source = local(recording.where, folder / COPY)
     settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # others' worlds are not ours
-    with MapRun(source, folder / "map", **settings, notify=notes.append) as run:
+
+    def tell(note: str) -> None:
+        notes.append(_named(note, recording, folder))
+
+    with MapRun(source, folder / "map", **settings, notify=tell) as run:
         run.mapper.map.listeners.append(lambda evidence: told.append(boxes_with(layout, evidence)))
         made = run.finish()
     if recording.poses is None:
         return folder / "map", _by_frame(layout, _all_kept(made.map), told)
-    remapped = remap(folder / "map", local(recording.poses, folder / "poses"), folder / "remapped")
+    remapped = remap(folder / "map", local(recording.poses, folder / POSES), folder / "remapped")
     return remapped.out, [_around(layout, frame) for frame in _all_kept(remapped.map)]
 
 
@@ -377,7 +394,12 @@ def _lies_beside(path: str) -> bool:
 def _real(where: str) -> str:
     """Return what is the same for all names of a recording: links are followed, options stay."""
     path = file_part(where)
-    return where.rstrip("/") if not os.path.exists(path) else os.path.realpath(path) + where.removeprefix(path)
+    return where if not os.path.exists(path) else os.path.realpath(path) + where.removeprefix(path)
+
+
+def _bare(where: str) -> str:
+    """Return a name without slashes at its end: what is kept of a recording goes by its name."""
+    return where if "?" in where else where.rstrip("/") or where
 
 
 def _listed(file: Path) -> list[Recording]:
@@ -409,7 +431,9 @@ def fingerprint(where: str) -> list[Any]:
     Folders that are links are followed.
     """
     if is_url(where):
-        return list(_stored(where)[1].items())
+        with suppress(NoBucketError):  # told where the recording is copied
+            return list(_stored(where)[1].items())
+        return []
     path = file_part(where)
     found: list[list[Any]] = []
     for file in [path] if os.path.isfile(path) else _below(path):

@@ -21,7 +21,7 @@ from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.fleet.cluster import cluster
 from stereovox.fleet.fleet import Progress, suggested
-from stereovox.fleet.recordings import Recording, Recordings, digest, fingerprint, local, recordings_of, why_not
+from stereovox.fleet.recordings import COPY, Recording, Recordings, digest, fingerprint, local, recordings_of, why_not
 from stereovox.maps.boxed_manifest import only_writer_at
 from stereovox.maps.store import MANIFEST
 from stereovox.opening import open_source
@@ -194,7 +194,7 @@ def score_recording(
         for number, (key, config) in enumerate(configs.items()):
             started = perf_counter()
             try:
-                where = where or local(recording.where, Path(folder) / "recording")  # of an object store once
+                where = where or local(recording.where, Path(folder) / COPY)  # of an object store once
                 sizes = config.voxel_size, config.max_range
                 if sizes not in truths:  # first: a recording without a lidar is not mapped for nothing
                     source: Any = open_source(where)
@@ -202,7 +202,7 @@ def score_recording(
                     truths[sizes] = TruthCells(truth, options.tolerance)
                 row = _scored(where, Path(folder) / f"map{number}", config, truths[sizes], options, recording)
             except Exception as error:
-                why = why_not(recording.where, error, Path(folder))
+                why = why_not(recording, error, Path(folder))
                 row = RecordingScore(recording.where, config.profile, error=why)
             rows[key] = replace(row, seconds=perf_counter() - started)
             if not row.error:  # what failed is tried again

@@ -48,6 +48,14 @@ def test_images_without_poses_say_what_is_missing_and_what_they_are_good_for(rec
     assert (found.facts["posed"], "no poses" in found.facts["missing"]) == (0, True)
 
 
+def test_the_manifest_of_a_map_is_no_calibration(tmp_path):
+    VoxelMap.from_cells(load_config(), [[0, 0, 0]], [2.0]).save(tmp_path / "m.svox")
+    with pytest.raises(StereovoxError, match=rf"which is the folder; type: stereovox info {tmp_path}/m\.svox$"):
+        sv.describe(tmp_path / "m.svox/manifest.json")
+    (tmp_path / "manifest.json").write_text('{"fx": 500, "fy": 500, "cx": 320, "cy": 240}')
+    assert sv.describe(tmp_path / "manifest.json").kind == "calibration"
+
+
 def test_a_map_keeps_its_keys_and_says_which_way_is_up(tmp_path, capsys):
     voxel_map = VoxelMap.from_cells(load_config(up="-y"), [[0, 0, 0]], [2.0])
     voxel_map.save(tmp_path / "m.svox")

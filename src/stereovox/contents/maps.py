@@ -13,11 +13,12 @@ import numpy as np
 
 from stereovox.config import Config, load_config, profile_names
 from stereovox.contents.description import Description, command_line, picture_name, size, thousands
+from stereovox.errors import MapFileError
 from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State, VoxelMap, load_map
 from stereovox.maps.boxed_map import BoxedMap
-from stereovox.maps.store import is_map
-from stereovox.safe_io import FLOOR_READABLE
+from stereovox.maps.store import FORMAT, MANIFEST, is_map
+from stereovox.safe_io import FLOOR_READABLE, read_part
 from stereovox.trust.health import FULL
 from stereovox.view.grid import known_bounds
 
@@ -28,6 +29,7 @@ ALWAYS_PRINTED = ("profile", "voxel_size", "integrator", "max_range")
 def describe_map(path: str) -> Description | None:
     """Describe a folder of a map in space; None for anything else. Raises MapFileError for a damaged one."""
     if not is_map(path):
+        _refuse_manifest(Path(path))
         return None
     voxel_map = load_map(path)
     bounds, config, kept = voxel_map.bounds(), voxel_map.config, voxel_map.kept_frames
@@ -57,6 +59,14 @@ def describe_map(path: str) -> Description | None:
     }
     commands = [command_line("picture", path, picture_name(path)), command_line("view", path)]
     return Description("map", _lines(result), result, commands)
+
+
+def _refuse_manifest(path: Path) -> None:
+    """Raise MapFileError where a map is named by its manifest, which has numbers as calibrations have them."""
+    if path.name == MANIFEST and path.is_file() and FORMAT.encode() in read_part(path, 0, 100):
+        raise MapFileError(
+            f"{path}: is a file of a map, which is the folder; type: {command_line('info', path.parent)}"
+        )
 
 
 def _boxes(voxel_map: VoxelMap) -> dict[str, Any] | None:

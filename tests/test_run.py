@@ -168,6 +168,13 @@ def test_who_goes_on_without_the_kept_frames_is_told(tmp_path):
     assert any("the 6 frames that the map kept are given up (map.keep_frames=false)" in line for line in told)
 
 
+def test_who_goes_on_with_a_map_in_boxes_is_said(tmp_path):
+    out = tmp_path / "city.svox"
+    sv.save_boxed(sv.VoxelMap.from_cells(sv.load_config(), [[0, 0, 0]], [1.0]), out)
+    with pytest.raises(sv.StereovoxError, match=rf"stereovox fleet RECORDING \.\.\. --out {out} --resume"):
+        sv.map_recording(SOURCE, out, resume=True)
+
+
 def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
     out = tmp_path / "a.svox"
     with pytest.raises(sv.StereovoxError, match="no map to go on with"):

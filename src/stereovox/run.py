@@ -32,7 +32,7 @@ from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
-from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
+from stereovox.maps.store import check_target, is_boxed, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
 from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.pose_graph import need_gtsam
@@ -242,6 +242,11 @@ class MapRun:
             if self._close_loops:
                 need_gtsam()
             check_in_space(self.out)
+            if self._resume and is_boxed(self.out):
+                raise StereovoxError(
+                    f"{self.out}: is a map in boxes; a fleet's is gone on with by: stereovox fleet RECORDING ... "
+                    f"--out {self.out} --resume (name those that are in it, too)"
+                )
             check_target(self.out)
             if self._resume and not is_map(self.out):
                 raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")

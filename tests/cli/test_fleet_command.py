@@ -3,6 +3,8 @@
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 
 import stereovox as sv
@@ -26,6 +28,23 @@ def test_two_recordings_one_line(tmp_path, capsys):
     assert result["occupied"] == big.counts()["occupied"] > 0
     assert main(["fleet", ONE, "--out", str(out), *WORDS]) == 2
     assert "--resume" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_one_thing_is_not_many(tmp_path, capsys):
+    """A single frame of a single recording, in a single box."""
+    (tmp_path / "scan/depth").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "scan/depth/0.png"), np.full((48, 64), 1000, np.uint16))
+    (tmp_path / "scan/camera.toml").write_text("width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 31.5\ncy = 23.5\n")
+    (tmp_path / "scan/poses.txt").write_text("1 0 0 9 0 1 0 9 0 0 1 9\n")
+    scan, out = str(tmp_path / "scan?depth_scale=1000"), str(tmp_path / "m.svox")
+    words = ["fleet", scan, "--out", out, *WORDS, "--box", "51.2"]
+    assert main([*words, "--plan"]) == 0
+    assert main(words) == 0
+    said = capsys.readouterr().err
+    assert "1 frame of 1 recording\n" in said
+    assert "at least 1 box of 51.2 m" in said
+    assert "1 frame, each in 1.0 of 1 box, 1 of which was mapped now" in said
 
 
 def test_a_plan_writes_nothing(tmp_path, capsys):

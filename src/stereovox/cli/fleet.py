@@ -19,8 +19,8 @@ from stereovox.cli.terminal import (
     say,
     say_about_compiling,
     size,
-    thousands,
 )
+from stereovox.contents.description import many
 
 if TYPE_CHECKING:
     from stereovox.fleet import FleetMap, FleetPlan
@@ -68,11 +68,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _say_plan(plan: FleetPlan) -> None:
-    say(f"{thousands(plan.frames)} frames of {plan.recordings} recordings")
-    say(f"at least {plan.boxes} boxes of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
+    say(f"{many(plan.frames, 'frame')} of {many(plan.recordings, 'recording')}")
+    say(f"at least {_boxes(plan.boxes)} of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
     say(f"{size(plan.bytes)} of depth images to keep; {_time(plan.core_hours)} of a core like one of this machine")
     for line in plan.unreadable:
         say(f"cannot be read: {line}")
+
+
+def _boxes(number: int) -> str:
+    return "1 box" if number == 1 else f"{number:,} boxes"
 
 
 def _time(hours: float) -> str:
@@ -90,10 +94,10 @@ def _say_map(made: FleetMap) -> None:
     refused = [one for one in made.recordings if one.refused]
     for one in refused[:SHOWN]:
         why = ", ".join(f"{number} x {reason}" for reason, number in one.refused.items())
-        say(f"{one.recording}: {thousands(one.frames)} frames, refused: {why}")
+        say(f"{one.recording}: {many(one.frames, 'frame')}, refused: {why}")
     if len(refused) > SHOWN:
-        say(f"and {len(refused) - SHOWN} recordings more with refused frames (--json)")
-    frames = thousands(made.map.frames)
-    say(f"{frames} frames, each in {made.overlap:.1f} of {boxes} boxes, {mapped} of which were mapped now")
+        say(f"and {many(len(refused) - SHOWN, 'recording')} more with refused frames (--json)")
+    frames, were = many(made.map.frames, "frame"), "was" if mapped == 1 else "were"
+    say(f"{frames}, each in {made.overlap:.1f} of {_boxes(boxes)}, {mapped} of which {were} mapped now")
     say(cells_line({**made.map.counts(), "memory_bytes": made.map.memory_bytes}))
     say(f"saved in {made.out}; look at it with: {command_line('view', made.out)}")

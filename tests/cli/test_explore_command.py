@@ -22,6 +22,11 @@ def test_explore_writes_a_report_and_a_map(told_with_notes, tmp_path):
     assert load_map(result["maps"][0]).config.voxel_size == 0.2
 
 
+def test_explore_says_how_to_have_a_page(told_with_notes):
+    said = told_with_notes("explore", "sim:hall?plan=2", "--seeds", "2:3", "--seconds", 1, "--voxel-size", 0.2)[1]
+    assert said.splitlines()[-1].startswith("nothing is written; --out DIR writes a page")
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

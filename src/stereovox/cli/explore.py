@@ -74,6 +74,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         )
     say_table(report.HEADS, report.rows_of(result))
     if folder is None:
+        say("nothing is written; --out DIR writes a page of all flights, and the map of each scene's first")
         return result
     files = report.write_missions(folder, result)
     say(f"written: {', '.join([*files.values(), *result['maps']])}")

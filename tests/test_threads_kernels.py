@@ -2,14 +2,16 @@
 
 import multiprocessing
 import pickle
+import signal
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from stereovox.threads import Ahead, Scratch, in_shards, run_both, shards
+from stereovox.threads import Ahead, Scratch, in_shards, run_both, shards, uninterrupted
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
@@ -139,3 +141,34 @@ def test_a_copy_has_begun_nothing():
     ahead = Ahead(abs)
     ahead.begin(-1)
     assert pickle.loads(pickle.dumps(ahead))(-1) == 1
+
+
+@pytest.mark.usefixtures("obeys_signals")
+@pytest.mark.parametrize("fails", [False, True])
+def test_ctrl_c_waits_for_the_outermost_step_and_is_not_lost_where_that_fails(fails):
+    done = []
+
+    def step():
+        with uninterrupted():
+            with uninterrupted():
+                signal.raise_signal(signal.SIGINT)
+            done.append("all")
+            if fails:
+                raise ValueError
+
+    with pytest.raises(KeyboardInterrupt):
+        step()
+    assert done == ["all"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("obeys_signals")
+def test_steps_of_other_threads_and_other_handlers_of_ctrl_c_are_left_alone():
+    def handler():
+        with uninterrupted():
+            return signal.getsignal(signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(handler).result() is signal.default_int_handler
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    assert handler() is signal.SIG_IGN

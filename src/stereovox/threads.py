@@ -251,8 +251,8 @@ def uninterrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    if received:
-        raise KeyboardInterrupt
+        if received:  # also where what was done here failed
+            raise KeyboardInterrupt
 
 
 def one_state(function: Callable[P, T]) -> Callable[P, T]:

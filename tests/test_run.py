@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording becomes a map by one call from Python, with all that `stereovox map` promises (tests/cli)."""
 
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import current_thread
@@ -233,3 +234,25 @@ def test_a_map_made_level_with_a_profile(tmp_path):
     result = sv.map_recording(box, tmp_path / "a.svox", profile="default", level=True, voxel_size=0.4)
     assert result.map.config.up == "z"
     np.testing.assert_allclose(result.map.config.levelled_from, [0, 0, 1], atol=0.1)
+
+
+@pytest.mark.usefixtures("obeys_signals")
+def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monkeypatch):
+    set_handler, usual = signal.signal, [signal.getsignal(number) for number in run._default_signals()]
+
+    def prompt(number, handler):
+        before = set_handler(number, handler)
+        if handler not in (signal.SIG_IGN, *usual):
+            signal.raise_signal(number)
+        return before
+
+    monkeypatch.setattr(signal, "signal", prompt)
+    with pytest.raises(KeyboardInterrupt), run.ended_in_order():
+        pytest.fail("the signal came before")
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == usual
+
+
+@pytest.mark.usefixtures("obeys_signals")
+def test_signals_are_left_to_the_main_thread():
+    with ThreadPoolExecutor(1) as other:
+        assert other.submit(run._default_signals).result() == []

@@ -607,7 +607,7 @@ def interrupt_between_steps() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt(received[0])
 
     with ExitStack() as stack:
-        for number in _default_signals() if threading.current_thread() is threading.main_thread() else ():
+        for number in _default_signals():
             stack.callback(signal.signal, number, signal.signal(number, remember))
         yield check
 
@@ -618,7 +618,7 @@ def ended_in_order() -> Iterator[None]:
 
     What cleans up after that is not disturbed by those that follow, nor by another Ctrl-C.
     """
-    before = {}
+    before = {number: signal.getsignal(number) for number in _default_signals()}
 
     def end(number: int, _: object) -> None:
         for one in before:
@@ -626,8 +626,8 @@ def ended_in_order() -> Iterator[None]:
         raise KeyboardInterrupt(number)
 
     try:
-        if threading.current_thread() is threading.main_thread():
-            before.update({one: signal.signal(one, end) for one in _default_signals()})
+        for one in before:
+            signal.signal(one, end)
         yield
     finally:
         for one, handler in before.items():
@@ -635,7 +635,12 @@ def ended_in_order() -> Iterator[None]:
 
 
 def _default_signals() -> list[int]:
-    """Return the signals with default handling: notebooks, servers, nohup and background jobs set their own."""
+    """Return the signals with default handling: notebooks, servers, nohup and background jobs set their own.
+
+    None in a thread other than the main one, which alone may handle signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return []
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     if hasattr(signal, "SIGHUP"):
         usual[signal.SIGHUP] = signal.SIG_DFL

@@ -165,7 +165,10 @@ def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str |
 
 
 def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
-    """Return how many kept frames two maps have in common; `merge` counts them once."""
+    """Return how many kept frames two maps have in common; `merge` counts them once.
+
+    Raises StereovoxError where a map did not keep its frames.
+    """
     ours, theirs = ({_identity(frame) for frame in need_frames(one.kept_frames, "a map").frames} for one in (a, b))
     return len(ours & theirs)
 

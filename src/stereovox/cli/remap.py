@@ -17,8 +17,8 @@ EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
 
 FAR = 10.0
 """How many times the extent of their way frames may move without a note."""
-FAR_TURNED = 45.0
-"""Degrees by which half of them may turn without one."""
+FAR_TURNED_DEG = 45.0
+"""By how much half of them may turn without one."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -51,16 +51,16 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say(f"note: {done.beyond} poses are from before the first frame or after the last, and were not used")
     if not report.all_frames:
         say(f"note: only {report.mapped} frames were kept (map.frames_budget); the map is what these make")
-    (median, most), (turned, most_turned) = done.moved_m, done.turned_deg
+    (median, most), (turned_deg, most_turned_deg) = done.moved_m, done.turned_deg
     say(
-        f"{report.moved} frames moved, by {median:.2f} m and {turned:.1f} degrees (median), at most {most:.2f} m and "
-        f"{most_turned:.1f} degrees; {report.mapped} were mapped again, {report.blocks} blocks made anew"
+        f"{report.moved} frames moved, by {median:.2f} m and {turned_deg:.1f} degrees (median), at most {most:.2f} m "
+        f"and {most_turned_deg:.1f} degrees; {report.mapped} were mapped again, {report.blocks} blocks made anew"
     )
     if most > FAR * max(done.way_m, 1.0):
         say(
             f"note: that is far beyond the {done.way_m:.1f} m of their way; poses must be in metres, in the map's world"
         )
-    if turned > FAR_TURNED:
+    if turned_deg > FAR_TURNED_DEG:
         say(
             "note: that is far to turn; poses must be of the optical frame (x right, y down, z forward), quaternions "
             "x y z w"

@@ -144,7 +144,10 @@ def _places(
 
 
 def _areas(closer: LoopCloser) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the parts of where a camera may be that was near a recording's: middles and half sizes (2,), levelled."""
+    """Return the parts of the area near a recording's way in which another camera is sought.
+
+    They are rectangles by their middles and half sizes (2,) in metres, levelled.
+    """
     level = np.array([one.T_map_anchor[:3, 3] for one in closer.submaps]) @ closer.R_level_map.T[:, :2]
     low, high = level.min(axis=0) - BEYOND_M, level.max(axis=0) + BEYOND_M
     count = np.ceil((high - low) / AREA_M).astype(int)

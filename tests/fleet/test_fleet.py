@@ -316,6 +316,7 @@ def test_two_fleets_do_not_write_one_map(mapped, where):
     assert "s3:" not in where or f"process {os.getpid()} on {socket.gethostname()})" in str(refused.value)
 
 
+@pytest.mark.usefixtures("obeys_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_fleet_that_is_told_to_end_gives_the_map_to_the_next(mapped, where, monkeypatch, number):
     before = signal.getsignal(number)
@@ -367,7 +368,7 @@ def test_a_recording_whose_reader_fails_is_named_and_left_out(mapped, tmp_path, 
 
 
 def test_more_boxes_than_a_map_may_have_are_told_before_they_are_mapped(mapped, tmp_path, monkeypatch):
-    monkeypatch.setattr(fleet, "MOST_BOXES", 3)
+    monkeypatch.setattr(fleet, "MAX_BOXES", 3)
     monkeypatch.setattr(fleet, "map_box", None)
     with pytest.raises(StereovoxError, match="larger boxes"):
         mapped([recording(1)], tmp_path / "m.svox")

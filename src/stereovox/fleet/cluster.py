@@ -83,7 +83,8 @@ def cluster(
 ) -> Iterator[Cluster]:
     """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it.
 
-    Raises StereovoxError where no scheduler answers, and for a number of workers that cannot be.
+    notify: called with each line that a user should see. Raises StereovoxError where no scheduler answers or a worker
+    has another stereovox, and for less than one worker; MissingExtra where Dask is not installed.
     """
     if workers is not None and workers < 1:
         raise StereovoxError(f"{workers} workers: give 1 or more, or leave it out for one on each core")

@@ -51,7 +51,7 @@ from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
 
 MAX_SETTINGS = 1 << 20
-MOST_BOXES = 250_000
+MAX_BOXES = 250_000
 """That a manifest can name, with those of the levels and with what all are made of."""
 OVERLAP = 4.0
 """Boxes that a frame shall be in at most, about."""
@@ -164,9 +164,9 @@ def map_fleet(
                 )
             _check_still_there(place, reports)
             boxes = _boxes(place, layout, [(keys[one], reports[one].frames) for one in used])
-            if len(boxes) > MOST_BOXES:
+            if len(boxes) > MAX_BOXES:
                 raise StereovoxError(
-                    f"{len(boxes):,} boxes of {layout.side} cells: a map has at most {MOST_BOXES:,}; choose larger "
+                    f"{len(boxes):,} boxes of {layout.side} cells: a map has at most {MAX_BOXES:,}; choose larger "
                     "boxes (--box, at most 512 cells), or make several maps"
                 )
             before = BoxesBefore(place)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording becomes a map by one call from Python, with all that `stereovox map` promises (tests/cli)."""
 
+import json
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -167,6 +168,24 @@ def test_who_goes_on_without_the_kept_frames_is_told(tmp_path):
     assert not any("given up" in line for line in told)
     sv.map_recording(SOURCE, out, resume=True, frames=":8", notify=told.append, **{"map.keep_frames": False})
     assert any("the 6 frames that the map kept are given up (map.keep_frames=false)" in line for line in told)
+
+
+@pytest.mark.parametrize("how", ["damaged", "gone"])
+def test_kept_frames_that_are_lost_can_be_given_up(tmp_path, how):
+    """The command that the message names goes on with the map, which then merges by adding up."""
+    kept = {**SETTINGS, "frames": ":6", "map.keep_frames": True}
+    one, two = (sv.map_recording(SOURCE, tmp_path / name, **kept).out for name in ("a.svox", "b.svox"))
+    pack = one / json.loads((one / "manifest.json").read_text())["kept_frames"]["packs"][0]
+    pack.write_bytes(bytes(pack.stat().st_size)) if how == "damaged" else pack.unlink()
+    cure = f"stereovox map RECORDING --out {one} --resume --set map.keep_frames=false"
+    for fails in (
+        lambda: sv.map_recording(SOURCE, one, resume=True, frames=":8"),
+        lambda: sv.merge(sv.load_map(one), sv.load_map(two)),
+    ):
+        with pytest.raises(sv.StereovoxError, match=cure):
+            fails()
+    assert sv.map_recording(SOURCE, one, resume=True, frames=":8", **{"map.keep_frames": False}).map.frames == 8
+    assert sv.merge(sv.load_map(one), sv.load_map(two)).frames == 14
 
 
 def test_who_goes_on_with_a_map_in_boxes_is_said(tmp_path):

@@ -241,7 +241,7 @@ def read_frame(place: Place, key: str, frame: KeptFrame) -> Frame | Cloud:
     try:
         return frame.frame()
     except MapFileError as error:
-        raise _damaged(place, key, error) from None
+        raise _damaged(place, key, str(error).partition(";")[0]) from None  # the cure is another one
 
 
 def digest(parts: Any) -> str:

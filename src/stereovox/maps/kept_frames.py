@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -85,10 +86,11 @@ class InFile:
             if self.place != place:  # another thread has saved the map meanwhile
                 return self.read()
             raise MapFileError(
-                f"{file}: kept frames cannot be read ({error.strerror}); was the map saved anew? load it again"
+                f"{file}: kept frames cannot be read ({error.strerror}); was the map saved anew? load it again, "
+                f"or {_give_up(file.parent)}"
             ) from None
         if digest_of(content) != self.digest:
-            raise MapFileError(f"{file}: kept frames are damaged; make the map anew")
+            raise MapFileError(f"{file}: kept frames are damaged; make the map anew, or {_give_up(file.parent)}")
         return content
 
 
@@ -324,6 +326,12 @@ def blocks_seen(evidence: Evidence) -> NDArray[np.int32]:
 def digest_of(content: bytes) -> str:
     """Return 24 hexadecimal digits that tell whether bytes are still the same."""
     return hashlib.blake2b(content, digest_size=12).hexdigest()
+
+
+def _give_up(folder: Path) -> str:
+    """Return how a map whose cells are whole can be used without its frames."""
+    words = "stereovox", "map", "RECORDING", "--out", str(folder), "--resume", "--set", "map.keep_frames=false"
+    return f"give them up to go on or to merge: {shlex.join(words)}"
 
 
 def _packed(image: NDArray[Any]) -> bytes:

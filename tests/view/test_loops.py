@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The picture of loop closure shows both ways, the loops where they are, reasons, and the map before and after."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
@@ -117,6 +119,14 @@ def test_numbers_and_reasons_are_said():
     assert "and 2 more refused" in words(figure)
     numbers = [text.get_text() for text in panel(figure, "way from above").texts]
     assert numbers == [str(n) for n in range(1, LISTED + 1)]
+
+
+def test_numbers_at_one_place_do_not_lie_on_each_other():
+    figure = loops_figure(closure_of([(0, 8)], [(0, 2), (1, 2), (3, 2), (4, 2), (5, 6), (7, 6)]), AFTER_MAP, BEFORE_MAP)
+    figure.draw_without_rendering()
+    discs = [text.get_bbox_patch().get_window_extent() for text in panel(figure, "way from above").texts]
+    assert len(discs) == 6
+    assert not any(one.overlaps(other) for one, other in combinations(discs, 2))
 
 
 def test_without_loops_it_says_so_and_shows_no_map():

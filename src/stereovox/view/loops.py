@@ -27,8 +27,8 @@ WINDOW_M = 5.0
 """Metres of the map that are shown from near, and as many more as poses were off there, twice."""
 LISTED = 6
 """Refused loops whose reasons are listed."""
-STAGGER = 20, 40, 60
-"""Points above their place at which numbers stand in turn: refused loops often lie side by side."""
+ABOVE = 20
+"""Points above its place at which a number stands, and by which it is moved up while another one is there."""
 LINE_IN = 0.26
 """Inches from one line of text to the next."""
 
@@ -61,7 +61,7 @@ def loops_figure(closure: LoopClosure, after: VoxelMap, before: VoxelMap | None 
     near = [(name, one) for name, one in (("before", before), ("after", after)) if one is not None and window]
     words = _reasons(closure)
     figure, panels = _panels(closure, across, [name for name, _ in near], len(words))
-    _draw_ways(panels["ways"], closure, across)
+    marks = _draw_ways(panels["ways"], closure, across)
     for name, voxel_map in near:
         assert window is not None
         poses = closure.T_world_before if name == "before" else closure.T_world_sensor
@@ -74,6 +74,7 @@ def loops_figure(closure: LoopClosure, after: VoxelMap, before: VoxelMap | None 
         _draw_box(panels["ways"], window)
     panels["words"].text(0, 1, "\n".join(words), va="top", fontsize=10.5, color=INK, linespacing=1.5)
     title_above(figure, f"Loop closure: {after.recording.removesuffix(CORRECTED) or 'a map'}", _facts(closure, after))
+    _move_apart(marks, panels["ways"])
     return figure
 
 
@@ -97,8 +98,8 @@ def _all_places(closure: LoopClosure) -> NDArray[np.float64]:
     return np.concatenate([closure.T_world_before[:, :3, 3], closure.T_world_sensor[:, :3, 3]])
 
 
-def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> None:
-    """Draw both ways from above, and the loops."""
+def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> list[Any]:
+    """Draw both ways from above, and the loops; return the numbers of refused ones."""
     axis.set_aspect("equal", adjustable="datalim")
     axis.grid(alpha=0.25)
     title(axis, "The camera's way from above")
@@ -109,10 +110,10 @@ def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> None:
     refused = closure.ends(closure.refused, closure.T_world_sensor)  # as their coordinates below
     if len(refused):
         _draw_lines(axis, refused, across, REFUSED, "--", f"{len(refused):,} refused: look alike, not believed")
-    for number, ends in enumerate(refused[:LISTED], 1):
-        _draw_number(axis, ends[1][list(across)], number)
+    marks = [_draw_number(axis, ends[1][list(across)], number) for number, ends in enumerate(refused[:LISTED], 1)]
     measured(axis, ("xyz"[across[0]], "xyz"[across[1]], ""))
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=10.5, labelcolor=INK)
+    return marks
 
 
 def _draw_way(axis: Any, poses: NDArray[np.float64], across: Sequence[int], colour: str, label: str = "") -> None:
@@ -140,14 +141,29 @@ def _draw_lines(
     axis.add_collection(lines)
 
 
-def _draw_number(axis: Any, place: NDArray[np.float64], number: int) -> None:
-    """Write a number on a disc above a place."""
-    axis.annotate(
-        str(number), place, (0, STAGGER[number % len(STAGGER)]), textcoords="offset points", ha="center", va="center",
-        fontsize=9.5, weight="bold", color="white", zorder=5,
+def _draw_number(axis: Any, place: NDArray[np.float64], number: int) -> Any:
+    """Write a number on a disc above a place, over the lines to later ones; return it."""
+    return axis.annotate(
+        str(number), place, (0, ABOVE), textcoords="offset points", ha="center", va="center",
+        fontsize=9.5, weight="bold", color="white", zorder=6 - number / (LISTED + 1),
         arrowprops={"arrowstyle": "-", "color": REFUSED, "linewidth": 0.8},
         bbox={"boxstyle": "circle,pad=0.2", "facecolor": REFUSED, "edgecolor": "white"},
     )  # fmt: skip
+
+
+def _move_apart(marks: Sequence[Any], axis: Any) -> None:
+    """Move numbers up that would lie on others: refused loops often lie side by side.
+
+    Call it when all panels are there: where places are on the page is known only from the finished layout.
+    """
+    axis.figure.draw_without_rendering()
+    up, taken = np.array([0.0, ABOVE]), list[NDArray[np.float64]]()
+    for mark in marks:
+        at = axis.transData.transform(mark.xy) * 72 / axis.figure.dpi + up
+        while any(np.linalg.norm(at - other) < ABOVE - 1e-6 for other in taken):
+            at = at + up
+            mark.xyann = tuple(mark.xyann + up)
+        taken.append(at)
 
 
 def _draw_box(axis: Any, window: Window) -> None:

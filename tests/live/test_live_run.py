@@ -20,6 +20,7 @@ from stereovox.errors import SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun, map_live
+from stereovox.live.stream import LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import State, load_map
 from stereovox.opening import open_source
@@ -30,6 +31,7 @@ from stereovox.sources.base import Stream
 from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.paced import Paced
 from stereovox.sources.poses import Poses
+from stereovox.track.tracker import Tracked
 
 SMALL = {"voxel_size": 0.1, "max_range": 4.0}
 
@@ -329,6 +331,29 @@ def test_a_tracked_camera_moves_the_others(tmp_path, monkeypatch):
     for frame in back:
         T_world_body = known.at(frame.stamp_ns) @ inverse(T_BODY_OPTICAL)
         np.testing.assert_allclose(frame.T_world_sensor, T_world_body @ behind.T_body_camera, atol=1e-9)
+
+
+def test_the_very_images_of_a_tracked_camera_are_expected_before_their_turn(monkeypatch):
+    expected, added = [], []
+
+    class Noting:
+        imu_use = ""
+
+        def __init__(self, config, camera):
+            pass
+
+        def expect(self, frame):
+            expected.append(frame)
+
+        def add(self, frame):
+            assert any(frame is one for one in expected)
+            added.append(frame)
+            return Tracked(np.eye(4), np.eye(6))
+
+    monkeypatch.setattr("stereovox.live.stream._LateTracker", Noting)
+    monkeypatch.setattr("stereovox.live.stream.UNTRACKED", 40)  # a busy machine drops none
+    assert len(list(LiveStream([LiveCamera(Images(count=4), "front")], TRACK))) == 4
+    assert list(map(id, expected)) == list(map(id, added))
 
 
 def test_a_tracked_map_cannot_be_resumed(tmp_path):

@@ -37,10 +37,10 @@ NEAR_M, SHORT_M = 0.5, 2.0
 """A way leads to within NEAR_M of where a frontier is seen from; where none does, one that ends SHORT_M short brings
 the vehicle nearer, and it looks from there."""
 SEEN_AGAIN, TRIES = 0.6, 3
-"""To look at what lies within so many metres of what was looked at, from within as many of there, brings nothing; nor
-does a way to there that had to be left so often."""
+"""A look at what is within so many metres of what was looked at before, from within as many metres of that place,
+shows nothing new. A way there that had to be left so often is not tried again."""
 ROUND_M, ROUNDS = 1.5, 3
-"""Metres between places from which it looks all round, and how often it does so in vain, one after another."""
+"""Metres between places from which it looks all round, and how many looks in a row may show no frontier to go to."""
 UNSEEN, NO_WAY, LOOKED_AT = "seen from nowhere", "no way to it", "looked at already"
 """Why a frontier is left."""
 
@@ -85,7 +85,7 @@ class Mission(Protocol):
     """What chooses goals.
 
     Attributes:
-        left: Once it is done: how many goals are left that it cannot come to, by why.
+        left: Once it is done: how many goals are left that it cannot reach, by why.
     """
 
     left: dict[str, int]
@@ -114,7 +114,7 @@ class MiddleOfRoom:
 
 
 class Frontiers:
-    """Explore: go to the frontier that is nearest along the way and look at it; where none can be come to, look all
+    """Explore: go to the frontier that is nearest along the way and look at it; where none can be reached, look all
     round from as near to one as the way leads, the largest first, until that was in vain ROUNDS times."""
 
     def __init__(self, smallest: int = 15, band: float = 0.6):
@@ -125,7 +125,7 @@ class Frontiers:
         self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the way to where the nearest frontier is seen from."""
+        """Return the way to where the nearest frontier is seen from, or to where it looks all round."""
         self._rounds = self._rounds or [ways.start]  # where it began it turned once
         height = ways.start[2]
         found = frontiers(

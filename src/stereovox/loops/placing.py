@@ -122,7 +122,8 @@ def _places(
 ) -> dict[int, list[Transform]]:
     """Return where each of these submaps of the second recording may lie in the first one's world (4, 4).
 
-    The first recording is searched part by part, so that the time grows with its way and no more, and memory does not.
+    The first recording is searched part by part, so that time and memory grow with its way and not with the area that
+    it spans.
     """
     shapes = {number: shape for number in numbers if (shape := second.shapes[second.submaps[number]]) is not None}
     beyond = max((float(np.linalg.norm(shape.points, axis=1).max()) for shape in shapes.values()), default=0.0)

@@ -151,6 +151,17 @@ def test_a_place_that_is_a_list_is_a_place():
     assert tracker.picture_use() == "4 pictures beside depth images are used"
 
 
+def test_only_images_whose_pose_is_asked_for_are_counted_and_each_once():
+    """Others may be expected; of many that are, some are seen twice."""
+    frames, tracker = pictured(seen(BAYS, aside(5)), BAYS), Tracker()
+    for frame in frames[:4]:
+        tracker.add(frame)
+        for _ in range(2):
+            for other in frames:
+                tracker.expect(other)
+    assert tracker.picture_use() == "4 pictures beside depth images are used"
+
+
 def test_images_narrower_than_a_corner_hold_nothing():
     frames, camera = pictured(seen(BAYS, aside(4)), BAYS), PinholeCamera(160, 3, 160, 160, 79.5, 1)
     random = np.random.default_rng(0)

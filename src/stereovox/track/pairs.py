@@ -72,6 +72,9 @@ class Pairs:
         mask = np.full(frame.left.shape, 255, np.uint8) if valid is None else valid.astype(np.uint8) * np.uint8(255)
         return Sight(frame.left, mask, partial(self._distances, Eyes(frame.left, frame.right)))
 
+    def count(self, seen: Sight) -> None:
+        """Do nothing: what of a pair cannot be used is refused."""
+
     def picture_use(self) -> str:
         """Return "": what of a pair cannot be used is refused."""
         return ""

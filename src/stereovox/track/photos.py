@@ -105,19 +105,11 @@ class Photos:
         self._landmarks = self._followed = None
         self._credit = 0
 
-    def see(
-        self, photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
-    ) -> Sighted | None:
-        """Return what of an image is used, None where it cannot be.
-
-        sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
-        """
-        self.offered += photo is not None
-        try:
-            return None if photo is None else sighted(photo, image, sigma_of, rows_per_metre)
-        except FrameRefused as refused:
-            self.left_out, self.why = self.left_out + 1, self.why or str(refused)
-            return None
+    def count(self, why: str | None) -> None:
+        """Take note of an image; why it cannot be used: as that of `sighted_or_why`."""
+        self.offered += why is not None
+        self.left_out += bool(why)
+        self.why = self.why or why or ""
 
     def picture_use(self) -> str:
         """Return how many images are used, or how many could not be and why, in words; "" where there is none."""
@@ -189,8 +181,21 @@ class Photos:
         return [(T @ inverse(seen.T_sensor_camera), one) for T, one in found if len(one.found) >= AGREED]
 
 
+def sighted_or_why(
+    photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
+) -> tuple[Sighted | None, str | None]:
+    """Return what of an image is used, and why it cannot be: "" where it can, None where there is no image.
+
+    sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
+    """
+    try:
+        return (None, None) if photo is None else (sighted(photo, image, sigma_of, rows_per_metre), "")
+    except FrameRefused as refused:
+        return None, str(refused)
+
+
 def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Sighted:
-    """Return an image with the depths that the depth image beside it measured; the rest as `Photos.see`.
+    """Return an image with the depths that the depth image beside it measured; the rest as `sighted_or_why`.
 
     Raises FrameRefused where the image cannot be read, or is not what its camera says.
     """

@@ -18,7 +18,7 @@ from stereovox.integrate.views import PerCamera
 from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
 from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, settled
-from stereovox.track.photos import Beside, Photos, Sighted
+from stereovox.track.photos import Beside, Photos, Sighted, sighted_or_why
 from stereovox.track.surfels import CONVERGED, Patches, SurfelMap, patches_of
 from stereovox.track.views import View, contradiction, is_new, stood_free, unlike, view_of
 
@@ -50,10 +50,14 @@ KEPT_M, CHECKED = 15.0, 100
 
 
 class Seen(NamedTuple):
-    """What of a frame is used: patches of its depth image, and the image that was taken along, if it can be used."""
+    """What of a frame is used: patches of its depth image, and the image that was taken along, if it can be used.
+
+    why: why that image cannot be used, as that of `sighted_or_why`.
+    """
 
     patches: Patches
     sighted: Sighted | None
+    why: str | None
 
 
 class Surfaces:
@@ -84,7 +88,11 @@ class Surfaces:
             words = f"only {len(patches.points)} patches of the image lie on surfaces, {MIN_PATCHES} are needed"
             raise FrameRefused(LOST, words)
         photo = frame.photo if isinstance(frame, Frame) else None
-        return Seen(patches, self._photos.see(photo, image, sigma_of, ROWS_PER_METRE))
+        return Seen(patches, *sighted_or_why(photo, image, sigma_of, ROWS_PER_METRE))
+
+    def count(self, seen: Seen) -> None:
+        """Take note of an image whose pose is asked for."""
+        self._photos.count(seen.why)
 
     def _sigma_of(self, camera: VirtualCamera) -> NDArray[np.float64]:
         depths = np.arange(round(FARTHEST_M * ROWS_PER_METRE)) / ROWS_PER_METRE

@@ -81,7 +81,14 @@ class Evidence(Protocol[Seen]):
     limits: Limits
 
     def see(self, frame: AnyFrame, /) -> Seen:
-        """Return what of a frame is used; raises FrameRefused where it cannot be."""
+        """Return what of a frame is used; raises FrameRefused where it cannot be.
+
+        It changes nothing that the other methods use: it may run in another thread, for frames that never come.
+        """
+        ...
+
+    def count(self, seen: Seen, /) -> None:
+        """Take note of an image whose pose is asked for."""
         ...
 
     def picture_use(self) -> str:
@@ -231,6 +238,7 @@ class Tracker:
             seen = self._see(frame)
         except FrameRefused as refused:
             return self._lose(str(refused))
+        self._evidence.count(seen)
         if self._learned < 2 and self._trial != 0:
             return self._begin(self._evidence, seen, frame.stamp_ns)
         if motion is None and (self._trial is None or self._later(frame.stamp_ns) > LONGEST):

@@ -321,7 +321,7 @@ def test_a_tracked_camera_moves_the_others(tmp_path, monkeypatch):
     images = Images("b", 10, 1 / 30, distance_m=1.0, begins=tracking)
     behind = LiveCamera(images, "back", mount_of([-0.1, 0, 0, 0, 0, 180]))
     cameras = [LiveCamera(front, "front"), behind]
-    done = map_live(cameras, tmp_path / "a.svox", poses=TRACK, observers=[keeper], **SMALL)
+    done = map_live(cameras, tmp_path / "a.svox", poses=TRACK, wait_s=10.0, observers=[keeper], **SMALL)
     assert done.poses == "track"
     front = [frame for frame in keeper.frames if frame.sensor == "front" and not frame.fault]
     back = [frame for frame in keeper.frames if frame.sensor == "back" and not frame.fault]

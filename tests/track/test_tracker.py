@@ -325,6 +325,9 @@ class Stub:
     def see(self, frame):
         return frame
 
+    def count(self, seen):
+        pass
+
     def forget(self):
         pass
 

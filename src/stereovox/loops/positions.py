@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,8 @@ class Positions:
     places: NDArray[np.float64]
     sigma_m: float
     where: str = "positions"
-    used: int = 0
-    contradicted: int = 0
+    used: int = field(default=0, init=False)
+    contradicted: int = field(default=0, init=False)
 
     def at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return places (M, 3) at other times, interpolated; NaN where none is near enough."""

@@ -250,7 +250,8 @@ class Tracker:
     def expect(self, frame: AnyFrame) -> None:
         """Begin with what can be done of a frame that `add` will get, in the background, while it has another one.
 
-        Poses are the same without. Nothing happens before the first frame is added.
+        Poses are the same without. Unlike that of `Mapper` it does so whatever `threads` is. Nothing happens before the
+        first frame is added.
 
         Args:
             frame: The very object that `add` will get. It must not change meanwhile.

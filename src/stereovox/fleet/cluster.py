@@ -19,6 +19,8 @@ LOST_WORKERS = 20
 """Workers that may be lost with the same task before it is given up."""
 RETRIES = 2
 """Times that a task that fails is tried again, on another worker if there is one."""
+SILENT = 60
+"""Above all levels of logging: while it closes, Dask logs tracebacks as critical. What fails is raised."""
 PATIENCE_S = 10
 """How long a scheduler may take to answer."""
 
@@ -106,7 +108,7 @@ def cluster(
         number = workers or cpu_count() or 1
         with _spared_ctrl_c():
             local: Any = LocalCluster(
-                n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+                n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=SILENT,
                 dashboard_address="127.0.0.1:0",
             )  # fmt: skip
         with local as cluster, Client(cluster) as client:

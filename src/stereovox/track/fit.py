@@ -81,7 +81,7 @@ def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
     def held(T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         information, gradient = equations(T)
         much, directions = _held(information, scale)
-        across = np.asarray(np.linalg.inv(directions), np.float64)  # its rows are the parts of a motion along the directions
+        across = np.asarray(np.linalg.inv(directions), np.float64)  # its rows give a motion along the directions
         return across.T @ (much[:, None] * across), across.T @ np.where(much > 0, directions.T @ gradient, 0.0)
 
     return held

@@ -27,6 +27,10 @@ BESIDE = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Half of the eight columns beside one."""
 
 
+class NoGroundError(StereovoxError):
+    """A map shows no surface on which something can stand."""
+
+
 @dataclass(frozen=True, eq=False)
 class Floor:
     """The columns of cells of a map, in a picture from above just large enough for what is known.
@@ -102,11 +106,11 @@ def ground_levels(
 ) -> tuple[np.ma.MaskedArray, NDArray[np.int64]]:
     """Return the level of the ground (rows, columns) in cells, masked where there is none, and of the lowest surface.
 
-    What is NOWHERE has no surface at all. Raises StereovoxError where there is no ground.
+    What is NO_SURFACE has no surface at all. Raises NoGroundError if there is no ground.
     """
     surfaces = floor.surfaces(height, step)
     if not len(surfaces):
-        raise StereovoxError(
+        raise NoGroundError(
             f"the map has no ground: nothing occupied with {height:g} m free above it; is the map's `up` right?"
         )
     climb = int(step / floor.side + TIE)

@@ -160,6 +160,47 @@ def test_images_before_the_first_pose_wait_and_are_counted(tmp_path):
     assert done.map.frames + done.map.frames_refused == 30 - before
 
 
+@pytest.mark.parametrize("offset_s", [100, -3])
+def test_a_camera_whose_clock_is_off_is_told_at_once_and_never_mapped_at_a_wrong_pose(offset_s, tmp_path):
+    cameras = [
+        LiveCamera(Images("a", 40), "good", mount_of([0, 0.1, 0, 0, 0, 90])),
+        LiveCamera(Images("b", 40, offset_ns=offset_s * 10**9), "off", mount_of([0, -0.1, 0, 0, 0, -90])),
+    ]
+    poses, keeper, lines = LivePoses(), Keeper(), []
+    with Sender(poses.add):
+        sleep(0.05)
+        done = map_live(cameras, tmp_path / "a.svox", poses=poses, observers=[keeper], notify=lines.append, **SMALL)
+    assert done.live["cameras"]["good"]["received"] == 40
+    mapped = [f.sensor for f, report in zip(keeper.frames, keeper.reports, strict=True) if not report.refused]
+    assert set(mapped) == {"good"}
+    assert {r.refused for f, r in zip(keeper.frames, keeper.reports, strict=True) if f.sensor == "off"} == {
+        "clock_doubt"
+    }
+    (line,) = [line for line in lines if line.startswith("off: ")]
+    assert f"{abs(offset_s)}"[:-1] in line
+    assert "--clock-offset" in line
+
+
+def test_a_camera_whose_clock_is_set_back_is_never_mapped_at_an_old_pose(tmp_path):
+    class SetBack(Images):
+        def __iter__(self):
+            for k, image in enumerate(super().__iter__()):
+                self.offset_ns = -400_000_000 if k >= 29 else 0  # of the next one
+                yield image
+
+    poses, keeper, lines = LivePoses(), Keeper(), []
+    with Sender(poses.add) as sender:
+        sleep(0.05)
+        camera = LiveCamera(SetBack("a", 60), "front")
+        map_live(camera, tmp_path / "a.svox", poses=poses, observers=[keeper], notify=lines.append, **SMALL)
+    mapped = [frame for frame, report in zip(keeper.frames, keeper.reports, strict=True) if not report.refused]
+    assert 20 < len(mapped) <= 31
+    for frame in mapped:
+        taken_ns = camera.source.stamps[int(frame.name.split()[1])]
+        assert np.abs(frame.T_world_sensor - pose_at(taken_ns, sender.begin_ns) @ T_BODY_OPTICAL).max() < 0.02
+    assert "was set back by this much" in lines[0]
+
+
 def test_no_pose_at_all_is_an_error_and_no_map(tmp_path):
     with pytest.raises(StereovoxError, match=r"written \(3 images came, but no pose: the tracker\)"):
         map_live(Images(count=3), tmp_path / "a.svox", poses=LivePoses("the tracker"), wait_s=0.01, **SMALL)

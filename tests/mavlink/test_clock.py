@@ -70,3 +70,37 @@ def test_a_clock_that_drifts_is_followed():
         at = k * 200 * MS
         ask(clock, at, MS, MS, ahead_ns=AHEAD_NS + at // 20_000)  # 50 ppm
     assert abs(clock.offset_ns - (AHEAD_NS + 999 * 200 * MS // 20_000)) < 0.5 * MS
+
+
+@pytest.mark.parametrize("step_ms", [-400, -150, -30, 30, 150, 400])
+def test_a_clock_that_is_set_is_known_again_with_the_first_answer(step_ms):
+    clock, random = RemoteClock(), np.random.default_rng(2)
+    for k in range(60):
+        ahead_ns = AHEAD_NS + (step_ms * MS if k >= 40 else 0)
+        ask(clock, k * 200 * MS, *(1 * MS + random.exponential(3 * MS, 2).astype(int)), ahead_ns)
+        if k != 40:
+            assert clock.times_set == (k > 40)
+    assert abs(clock.offset_ns - AHEAD_NS - step_ms * MS) < 3 * MS
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_clock_that_is_set_back_gives_no_time_until_it_is_known_again(answers):
+    clock, back_ns, wrong = RemoteClock(), 400 * MS, []
+    for k in range(200):
+        at, ahead_ns = k * 20 * MS, AHEAD_NS - (back_ns if k >= 100 else 0)
+        if answers and k % 10 == 0 and k != 100:
+            ask(clock, at, 2 * MS, 2 * MS, ahead_ns)
+        clock.heard(at + ahead_ns, at + 3 * MS)
+        local_ns = clock.local_ns(at + ahead_ns)
+        if local_ns is not None and abs(local_ns - at) > 5 * MS:
+            wrong.append(k)
+    assert not wrong
+    assert clock.offset_ns is not None
+    assert clock.times_set == 1
+
+
+def test_a_message_that_is_overtaken_is_no_clock_that_was_set():
+    clock = RemoteClock()
+    for k in range(3 * ENOUGH):
+        clock.heard(AHEAD_NS + (k * 20 - (50 if k % 7 == 0 else 0)) * MS, k * 20 * MS)
+    assert clock.times_set == 0

@@ -123,7 +123,7 @@ def test_nobody_waits_for_a_stream_that_has_ended():
 
 def test_threads_add_and_ask_at_once():
     """Two writers and three readers; every answer is the one truth, however the threads take turns."""
-    poses, wrong = LivePoses(max_speed_mps=1e3), []
+    poses, wrong = LivePoses(max_speed_mps=1e3, clock=lambda: 0.0), []  # all at once: no clock that was set back
 
     def write(first):
         for k in range(first, 2000, 2):
@@ -186,3 +186,29 @@ def test_who_listens_hears_of_each_pose():
     poses.add(0, pose())
     poses.end("over")
     assert heard == [1, 1]
+
+
+@pytest.mark.parametrize("back_ms", [30, 400, 900])
+def test_a_clock_that_is_set_back_by_little_never_mixes_with_what_came_before(back_ms):
+    now = [0.0]
+    poses, true = LivePoses(clock=lambda: now[0]), {}
+    for k in range(60):
+        now[0] = 0.01 * k
+        poses.add(10 * k * MS, pose(0.01 * k))
+    for k in range(60, 70):
+        now[0] = 0.01 * k
+        poses.add((10 * k - back_ms) * MS, pose(0.01 * k))
+        true[10 * k - back_ms] = 0.01 * k
+    assert poses.counts["clock_reset"] == 1
+    for ms, x in true.items():
+        assert poses.at(ms * MS)[0, 3] == pytest.approx(x)
+    assert poses.newest_ns == (690 - back_ms) * MS
+
+
+def test_a_pose_that_is_overtaken_is_no_clock_that_is_set_back():
+    poses = filled(*((t, pose(t / 1000)) for t in (0, 20, 10, 40, 30, 60, 50)))
+    for ms in (70, 110, 120, 130, 80, 90, 95, 100, 140):  # several that were held up come at once
+        poses.add(ms * MS, pose(ms / 1000))
+    assert not poses.counts["clock_reset"]
+    assert poses.at(97 * MS)[0, 3] == pytest.approx(0.097)
+    assert poses.at(55 * MS)[0, 3] == pytest.approx(0.055)

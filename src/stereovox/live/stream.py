@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stereovox.calibrate.live_clock import CameraClock
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
@@ -25,6 +26,7 @@ from stereovox.opening import open_camera
 from stereovox.pose_choice import GIVEN, HOW, TRACK
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.clock_watch import OPEN, ClockDoubt, Delays
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
 from stereovox.sources.live_poses import LivePoses
@@ -65,6 +67,7 @@ class _Feed:
     """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more.
 
     heard_ns: when its last image came, or it was started; monotonic. told: what the user was told last that is wrong.
+    clock: what watches its clock, where poses do not come with images.
     """
 
     camera: LiveCamera
@@ -79,13 +82,27 @@ class _Feed:
     told: str = ""
     host_clock: bool | None = None
     latest: Latest[AnyFrame] | None = None
+    clock: CameraClock | None = None
 
     def __post_init__(self) -> None:
         self.moments: OrderedDict[int, Moment] = OrderedDict()
 
     @property
+    def ahead_ns(self) -> int:
+        """By how much its stamps are ahead of the poses', as far as is known."""
+        return self.offset_ns - (self.clock.shift_ns if self.clock else 0)
+
+    @property
     def name(self) -> str:
         return self.camera.title
+
+
+class _Image(NamedTuple):
+    """An image that waits, and what is doubtful about its stamp."""
+
+    feed: _Feed
+    frame: AnyFrame
+    doubt: ClockDoubt | None
 
 
 class LiveStream(Stream):
@@ -148,14 +165,13 @@ class LiveStream(Stream):
         self.notes = tuple(note for feed in self._feeds for note in getattr(feed.stream, "notes", ()))
         self.moment = Moment("", None, 0)
         self.mounts = {feed.name: feed.camera.T_body_camera for feed in self._feeds}
-        self._waiting: Waiting[tuple[_Feed, AnyFrame]] = Waiting(
-            QUEUE, round(1e9 * wait_s), round(1e9 * LATE_S), monotonic_ns
-        )
+        self._waiting: Waiting[_Image] = Waiting(QUEUE, round(1e9 * wait_s), round(1e9 * LATE_S), monotonic_ns)
         self._change, self._stopped = Condition(), Event()
         self._remind = 0.0
         self.imu_use = ""
         if self.poses is not None:
             self.poses.listen(self._wake)
+            self._delays = Delays() if self.tracked else self.poses.delays  # of the images that poses are tracked by
 
     @property
     def dropped(self) -> int:
@@ -179,6 +195,7 @@ class LiveStream(Stream):
                 "dropped": self._waiting.dropped[feed.name] + (feed.latest.dropped if feed.latest else 0),
                 "before_first_pose": feed.before_first_pose,
                 **({"late": feed.stream.late} if isinstance(feed.stream, Paced) and feed.stream.late else {}),
+                **({"clock_found_s": -feed.clock.shift_ns / 1e9} if feed.clock and feed.clock.shift_ns else {}),
                 **({"failure": feed.failure} if feed.failure else {}),
             }
             for feed in self._feeds
@@ -211,6 +228,9 @@ class LiveStream(Stream):
                 stack.callback(self._stream.stop)
             for feed in self._feeds:
                 feed.heard_ns = monotonic_ns()
+                if self.poses is not None and not feed.tracked:
+                    feed.clock = self._clock_of(feed, self.poses)
+                    stack.callback(feed.clock.close)
                 thread = Thread(target=self._run, args=(feed,), name=f"stereovox-{feed.name}", daemon=True)
                 thread.start()
                 stack.callback(thread.join, STOPPING_S)
@@ -231,7 +251,7 @@ class LiveStream(Stream):
         if failures and len(failures) == len(self._feeds):
             raise SourceError(failures[0])
 
-    def _next(self) -> tuple[Arrival[tuple[_Feed, AnyFrame]] | None, bool]:
+    def _next(self) -> tuple[Arrival[_Image] | None, bool]:
         """Return an image whose pose is there or will not come, if any, and whether more may come."""
         with self._change:
             arrival = self._waiting.pop(self._ready)
@@ -242,15 +262,22 @@ class LiveStream(Stream):
             self._change.wait(SOON_S if len(self._waiting) else TICK_S)
             return self._waiting.pop(self._ready), True
 
-    def _ready(self, arrival: Arrival[tuple[_Feed, AnyFrame]]) -> bool:
-        feed, frame = arrival.content
+    def _ready(self, arrival: Arrival[_Image]) -> bool:
+        feed, frame, doubt = arrival.content
         if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
             return True
+        if doubt is not None and doubt.became == OPEN and not doubt.told:
+            return False  # the next image may show that this one was late
         return self.poses.is_final(arrival.stamp_ns)
 
-    def _framed(self, arrival: Arrival[tuple[_Feed, AnyFrame]]) -> AnyFrame | None:
+    def _clock_of(self, feed: _Feed, poses: LivePoses) -> CameraClock:
+        given_s, mount = feed.camera.clock_offset_s, feed.camera.T_body_camera
+        option = "--clock-offset (clock_offset_s)"
+        return CameraClock(feed.name, poses, self._delays, mount, self.config, self._notify, option, given_s)
+
+    def _framed(self, arrival: Arrival[_Image]) -> AnyFrame | None:
         """Return an image with its pose, or with a fault that says why it has none; None before the first pose."""
-        feed, image = arrival.content
+        feed, image, doubt = arrival.content
         frame = replace(image, sensor=feed.name, stamp_ns=arrival.stamp_ns)
         self.moment = feed.moments.pop(image.stamp_ns, Moment(feed.name, None, arrival.arrived_ns))
         if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
@@ -259,6 +286,8 @@ class LiveStream(Stream):
             feed.before_first_pose += 1
             return None
         try:
+            if feed.clock is not None:
+                feed.clock.check(frame, doubt, monotonic_ns())
             T_world_body = self.poses.at(frame.stamp_ns)
         except FrameRefused as refused:
             detail = f"{name_of(frame)}: {refused}"
@@ -272,8 +301,10 @@ class LiveStream(Stream):
         try:
             images = self._tracked(feed) if feed.tracked else self._noted(feed)
             for image in images:
+                stamp_ns = image.stamp_ns - feed.ahead_ns
+                doubt = feed.clock.heard(stamp_ns, monotonic_ns()) if feed.clock is not None else None
                 with self._change:
-                    self._waiting.put(feed.name, image.stamp_ns - feed.offset_ns, "", (feed, image))
+                    self._waiting.put(feed.name, stamp_ns, "", _Image(feed, image, doubt))
                     self._change.notify()
                 if self._stopped.is_set():
                     break
@@ -299,6 +330,8 @@ class LiveStream(Stream):
                 if feed.host_clock is None:
                     feed.host_clock = 0 <= now_ns - image.stamp_ns <= HOST_CLOCK_NS
                 feed.received, feed.heard_ns = feed.received + 1, arrived_ns
+                if feed.tracked:
+                    self._delays.heard(image.stamp_ns - feed.offset_ns, arrived_ns)
                 feed.moments[image.stamp_ns] = Moment(
                     feed.name, image.stamp_ns if feed.host_clock else None, arrived_ns
                 )

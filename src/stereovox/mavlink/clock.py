@@ -19,18 +19,23 @@ ENOUGH = 20
 """Messages that must have come before the least of their delays is believed."""
 LONGEST_ROUND_TRIP_NS = 100_000_000
 """Answers that took longer are passed over."""
-STARTED_AGAIN_NS = 1_000_000_000
-"""A clock that goes back by more was started anew."""
+SET_BACK_NS, SLACK_NS = 100_000_000, 5_000_000
+"""A clock that goes back by more than messages overtake each other was set; so was one that by its answers cannot be
+what it was before: each is off by half of its round trip at most, and by what clocks drift meanwhile."""
 
 
 class RemoteClock:
     """Turns times of another machine into this one's. Threads may share it.
 
     Without TIMESYNC, times come out late by the least delay of the link, which is not known.
+
+    Attributes:
+        times_set: How often the other clock was set, or started again: what was known of it is then forgotten.
     """
 
     def __init__(self) -> None:
         self._lock = Lock()
+        self.times_set = 0
         self._forget()
 
     def answered(self, sent_ns: int, remote_ns: int, received_ns: int) -> None:
@@ -45,13 +50,19 @@ class RemoteClock:
         if not 0 <= round_trip_ns <= LONGEST_ROUND_TRIP_NS:
             return
         with self._lock:
-            self._latest_answer_ns = self._checked(remote_ns, self._latest_answer_ns)
-            self._answers.append((round_trip_ns, remote_ns - (sent_ns + received_ns) // 2))
+            offset_ns = remote_ns - (sent_ns + received_ns) // 2
+            if self._answers:
+                best_trip_ns, best_ns = min(self._answers)
+                if abs(offset_ns - best_ns) > (round_trip_ns + best_trip_ns) // 2 + SLACK_NS:
+                    self._set_anew()
+            self._answers.append((round_trip_ns, offset_ns))
 
     def heard(self, remote_ns: int, received_ns: int) -> None:
         """Take the time that a message brings, in the other machine's nanoseconds, and when it came, in this one's."""
         with self._lock:
-            self._latest_heard_ns = self._checked(remote_ns, self._latest_heard_ns)
+            if remote_ns < self._latest_heard_ns - SET_BACK_NS:
+                self._set_anew()
+            self._latest_heard_ns = max(self._latest_heard_ns, remote_ns)
             self._heard.append(remote_ns - received_ns)
 
     @property
@@ -73,14 +84,11 @@ class RemoteClock:
         offset = self.offset_ns
         return None if offset is None else remote_ns - offset
 
-    def _checked(self, remote_ns: int, latest_ns: int) -> int:
-        """Return the latest time of the other clock; one that was started again is a new clock."""
-        if remote_ns < latest_ns - STARTED_AGAIN_NS:
-            self._forget()
-            return remote_ns
-        return max(latest_ns, remote_ns)
+    def _set_anew(self) -> None:
+        self.times_set += 1
+        self._forget()
 
     def _forget(self) -> None:
-        self._latest_answer_ns = self._latest_heard_ns = 0
+        self._latest_heard_ns = -(1 << 62)
         self._answers: deque[tuple[int, int]] = deque(maxlen=ANSWERS)
         self._heard: deque[int] = deque(maxlen=HEARD)

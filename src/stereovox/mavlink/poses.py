@@ -77,6 +77,7 @@ class PoseReceiver:
         self.taken = 0
         self.passed_over: dict[str, int] = {}
         self._resets: int | None = None
+        self._times_set = self.link.clock.times_set
         self._was_reset, self._T_world_autopilot = False, np.eye(4)
         self._recent: deque[tuple[int, Transform]] = deque(maxlen=2)
         self._last_odometry_ns = self._last_quaternion_ns = -PREFERRED_NS - 1
@@ -164,6 +165,9 @@ class PoseReceiver:
         if T_ned_frd is None or not np.isfinite(T_ned_frd).all():
             return self._pass_over("not finite", "the autopilot sends poses that are no numbers")
         self.link.clock.heard(remote_ns, came_ns)
+        if self.link.clock.times_set != self._times_set:
+            self._times_set = self.link.clock.times_set
+            self._tell(f"{self.link.url}: the autopilot's clock was set; its poses are used again once it is known")
         stamp_ns = self.link.clock.local_ns(remote_ns)
         if stamp_ns is None:
             return self._pass_over("clock", "the autopilot's clock is not known yet; poses are used once it is")

@@ -8,24 +8,37 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from threading import Condition
 from time import monotonic
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stereovox.errors import FrameRefused
 from stereovox.se3 import Transform, rigidity_error, rotation_vector
+from stereovox.sources.clock_watch import Delays
 from stereovox.sources.poses import Poses, seconds_from_ns
 
 KEPT = 4000
 """Poses that are kept: 20 s at 200 Hz. The older half is dropped when there are more."""
 RESET_NS = 1_000_000_000
 """A pose this much older than the newest one means that the clock was set back: all before it are dropped."""
+SET_BACK, REORDERED_NS = 3, 50_000_000
+"""So many poses in a row that ascend as time passes, all older than the newest one, mean the same. One that is
+older by more than messages overtake each other waits for the next ones, for it may be by another clock."""
 RIGID = 1e-3
 """Largest rigidity error of a pose that can be used."""
 MAX_SPEED_MPS, MAX_TURN_DPS = 10.0, 720.0
 """Speeds beyond which two neighbouring poses are a jump; as in `pair.toml`."""
 CLOCKS_APART_NS = 10_000_000_000
 """Images and poses that are further apart than this have different clocks."""
+
+
+class _Late(NamedTuple):
+    """A pose that is not newer than one before it, and when it came."""
+
+    stamp_ns: int
+    T: Transform
+    arrived_ns: int
 
 
 class LivePoses:
@@ -45,6 +58,7 @@ class LivePoses:
         added: Number of poses that were added.
         counts: What else became of them: `unusable`, `late` (older than one before), `repeated`, `clock_reset`,
             `jumps`.
+        delays: How long poses take to come, by `clock`.
     """
 
     def __init__(
@@ -62,6 +76,8 @@ class LivePoses:
         self._poses: dict[int, Transform] = {}
         self._change, self._ended = Condition(), ""
         self._listeners: list[Callable[[], object]] = []
+        self._late: list[_Late] = []
+        self.delays = Delays()
 
     def add(self, stamp_ns: int, T_world_body: ArrayLike) -> None:
         """Take in a pose; the first of several with one stamp counts.
@@ -76,9 +92,11 @@ class LivePoses:
         if rigidity_error(T) > RIGID or not np.isfinite(T).all():
             self.counts["unusable"] += 1
             T = np.full((4, 4), np.nan)
+        now_ns = round(1e9 * self._clock())
+        self.delays.heard(stamp_ns, now_ns)
         with self._change:
             self.added += 1
-            self._insert(stamp_ns, T)
+            self._take(stamp_ns, T, now_ns)
             self._change.notify_all()
         for tell in self._listeners:
             tell()
@@ -120,6 +138,14 @@ class LivePoses:
             raise FrameRefused("pose_jump", f"{self.where}: the body jumped between {times} s; leave the image out")
         return found
 
+    def between(self, first_ns: int, last_ns: int) -> Poses | None:
+        """Return the poses of a stretch of time, with one more at either end; None where there are fewer than two."""
+        with self._change:
+            begin = max(bisect_left(self._stamps, first_ns) - 1, 0)
+            stamps = self._stamps[begin : bisect_left(self._stamps, last_ns) + 1]
+            poses = [self._poses[stamp] for stamp in stamps]
+        return Poses(stamps, poses, where=self.where) if len(stamps) > 1 else None
+
     def is_final(self, stamp_ns: int) -> bool:
         """Return whether it is decided what `at` says: a pose that is not earlier came, or none will come any more."""
         with self._change:
@@ -151,12 +177,46 @@ class LivePoses:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def _take(self, stamp_ns: int, T: Transform, now_ns: int) -> None:
+        """Take in a pose; drop those of another clock where it was set back."""
+        newest = self._stamps[-1] if self._stamps else stamp_ns
+        if stamp_ns < newest - RESET_NS:
+            self._reset(-1)
+        elif self._stamps and stamp_ns <= newest:
+            if self._late and stamp_ns <= self._late[-1].stamp_ns:
+                self._insert_late()
+            self._late.append(_Late(stamp_ns, T, now_ns))
+            if newest - stamp_ns <= REORDERED_NS:
+                self._insert(stamp_ns, T)
+            if len(self._late) >= SET_BACK:
+                self._decide()
+            return
+        self._insert_late()
+        self._insert(stamp_ns, T)
+
+    def _decide(self) -> None:
+        """Put late poses in their places: of those before, if they come all at once; else they are by a new clock."""
+        first, last = self._late[0], self._late[-1]
+        if 2 * (last.arrived_ns - first.arrived_ns) > last.stamp_ns - first.stamp_ns:
+            self._reset(first.stamp_ns)
+        self._insert_late()
+
+    def _reset(self, before_ns: int) -> None:
+        """Drop all poses that are not before a time: the clock was set back. -1: all."""
+        self.counts["clock_reset"] += 1
+        left = 0 if before_ns < 0 else bisect_left(self._stamps, before_ns)
+        for stamp in self._stamps[left:]:
+            del self._poses[stamp]
+        del self._stamps[left:]
+
+    def _insert_late(self) -> None:
+        late, self._late = self._late, []
+        for one in late:
+            if one.stamp_ns not in self._poses:
+                self._insert(one.stamp_ns, one.T)
+
     def _insert(self, stamp_ns: int, T: Transform) -> None:
         stamps = self._stamps
-        if stamps and stamp_ns < stamps[-1] - RESET_NS:
-            self.counts["clock_reset"] += 1
-            stamps.clear()
-            self._poses.clear()
         if stamp_ns in self._poses:
             self.counts["repeated"] += 1
             return

@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The clock of a camera that runs now: noticed where it was set, found from motion, and corrected.
+
+`ClockWatch` notices that images come earlier or later than they should, which does not say whether their stamps are
+wrong. The camera's own motion, tracked from its images, does: it fits that of the poses at one offset of the clocks.
+Until that is found, an image is refused unless its pose is the same either way, since the body rests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.tracker import PoseTrack
+from stereovox.config import Config
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import AnyFrame, Cloud, Scan, name_of
+from stereovox.se3 import Transform, apart
+from stereovox.sources.clock_watch import CLOCK, LATE, ClockDoubt, ClockWatch, Delays
+from stereovox.sources.poses import Poses
+from stereovox.track.tracker import Tracker
+
+REASON = "clock_doubt"
+"""Why images are refused whose clock may be wrong."""
+TELL_NS, REMIND_NS = 300_000_000, 10_000_000_000
+"""How long a doubt lasts until the user is told, and until the user is told again."""
+SAME_M, SAME_RAD, SAMPLES = 0.02, np.radians(0.5), 5
+"""A body that moves by less between the two times that an image may be of, seen at so many times, rests."""
+BEFORE_NS, AFTER_NS = 500_000_000, 300_000_000
+"""How much longer a camera may take to deliver an image than poses take to come, and how much less."""
+GRID_NS, ALIKE_NS = 20_000_000, 100_000_000
+"""Between the offsets that are tried, and by which two differ that are not told from each other."""
+PAIR_NS, LONGEST_NS, MOST_PAIRS = 200_000_000, 450_000_000, 60
+"""Time between the two images of a pair, at least and at most, and how many of the last pairs are compared."""
+FEWEST, COVERED = 8, 0.6
+"""Fewest pairs that say something, and share of them that must lie among the poses."""
+TURN_RAD, WAY_M, CAP = np.radians(0.6), 0.015, 25.0
+"""Errors of a tracked motion and of a mount, as squares of which misfits count, each at most this much."""
+EXPLAINED, UNIQUE, SURE = 0.25, 2.0, 25.0
+"""An offset must leave no more than this share of the motion; others must fit so many times worse, and by so much."""
+
+
+class PosesNow(Protocol):
+    """The poses of a body as they come."""
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return T_world_body (4, 4) at a time; raises FrameRefused."""
+        ...
+
+    def between(self, first_ns: int, last_ns: int) -> Poses | None:
+        """Return the poses of a stretch of time, None where there are fewer than two."""
+        ...
+
+
+class MotionClock:
+    """Finds by how much the stamps of images are off, from their motion and that of the poses.
+
+    T_body_camera: (4, 4) float64, the mount of the camera.
+    """
+
+    def __init__(self, config: Config, T_body_camera: Transform, poses: PosesNow):
+        self._tracker, self._mount, self._poses = Tracker(config), T_body_camera, poses
+        self._tracked: list[tuple[int, Transform]] = []
+        self._pairs: list[tuple[int, int, Transform]] = []
+
+    def see(self, frame: AnyFrame) -> None:
+        """Track an image, whose stamp is by the clock of the poses as far as is known."""
+        tracked = self._tracker.add(frame)
+        if tracked.lost:
+            self._tracked.clear()
+            if tracked.begins:
+                self._pairs.clear()
+            return
+        now_ns, T_now = frame.stamp_ns, tracked.T_world_sensor
+        for then_ns, T_then in reversed(self._tracked):
+            if PAIR_NS <= now_ns - then_ns <= LONGEST_NS:
+                self._pairs.append((then_ns, now_ns, np.linalg.inv(T_then) @ T_now))
+                break
+        self._tracked = [one for one in self._tracked if 0 < now_ns - one[0] <= LONGEST_NS] + [(now_ns, T_now)]
+        del self._pairs[:-MOST_PAIRS]
+
+    def shift_ns(self, low_ns: int, high_ns: int) -> int | None:
+        """Return what must be added to stamps, between two limits, to be those of the poses; None: it is not certain.
+
+        Zero, and whatever lies near it, is among those that are tried.
+        """
+        if len(self._pairs) < FEWEST:
+            return None
+        first_ns, last_ns = self._pairs[0][0], self._pairs[-1][1]
+        near = np.arange(-ALIKE_NS - GRID_NS, ALIKE_NS + 2 * GRID_NS, GRID_NS)
+        shifts = np.unique(np.concatenate([np.arange(low_ns, high_ns + GRID_NS, GRID_NS), near])).astype(np.int64)
+        misfits, moved = self._misfits(shifts, first_ns, last_ns)
+        known = np.isfinite(misfits).any(axis=1)
+        if not known.any():
+            return None
+        usual = np.full(len(shifts), np.inf)
+        usual[known] = np.nanmean(misfits[known], axis=1)
+        best = int(np.argmin(usual))
+        if usual[best] > EXPLAINED * moved or not self._is_unique(shifts, misfits, usual, best):
+            return None
+        return int(shifts[best])
+
+    def _is_unique(
+        self, shifts: NDArray[np.int64], misfits: NDArray[np.float64], usual: NDArray[np.float64], best: int
+    ) -> bool:
+        """Return whether all offsets that are not those near the best fit clearly worse, as far as poses are known."""
+        for k in np.flatnonzero(np.isfinite(usual) & (np.abs(shifts - shifts[best]) > ALIKE_NS)):
+            both = np.isfinite(misfits[k]) & np.isfinite(misfits[best])
+            here, there = misfits[best][both].sum(), misfits[k][both].sum()
+            if there < UNIQUE * here or there - here < SURE:
+                return False
+        return True
+
+    def _misfits(self, shifts: NDArray[np.int64], first_ns: int, last_ns: int) -> tuple[NDArray[np.float64], float]:
+        """Return squared misfits (shifts, pairs), NaN where no poses are near, and how much the camera moved."""
+        from scipy.spatial.transform import Rotation
+
+        observed = np.array([T for _, _, T in self._pairs])
+        misfits = np.full((len(shifts), len(self._pairs)), np.nan)
+        for part in _near_each_other(shifts):
+            poses = self._poses.between(first_ns + int(shifts[part[0]]), last_ns + int(shifts[part[-1]]))
+            try:
+                track = None if poses is None else PoseTrack(poses, 0.0, 10.0, 720.0)
+            except StereovoxError:  # none of these poses can be used
+                track = None
+            if track is None or len(track.times) < 2:
+                continue
+            starts, ends = (
+                (np.array([pair[end] for pair in self._pairs], np.int64) - track.start_ns) / 1e9 for end in (0, 1)
+            )
+            for k in part:
+                begun, ended = starts + shifts[k] / 1e9, ends + shifts[k] / 1e9
+                inside = (track.parts(begun) >= 0) & (track.parts(begun) == track.parts(ended))
+                if inside.sum() < max(FEWEST, COVERED * len(self._pairs)):
+                    continue
+                first, then = track.at(begun[inside]) @ self._mount, track.at(ended[inside]) @ self._mount
+                left = np.linalg.inv(np.linalg.inv(first) @ then) @ observed[inside]
+                misfits[k, inside] = _squares(left, Rotation)
+        return misfits, float(np.mean(_squares(observed, Rotation)))
+
+
+class CameraClock:
+    """Watches the clock of one camera against that of the poses, tells the user, and corrects it.
+
+    Args:
+        name: What the camera is called, for messages.
+        poses: Those of the body.
+        delays: Their delays, which whoever receives them takes in.
+        T_body_camera: (4, 4) float64, the mount.
+        notify: Called with each line that a user should see.
+        option: What sets the clock by hand, for messages.
+        given_s: What it is set to, in seconds.
+        background: Whether images are tracked in a thread.
+
+    Attributes:
+        config: Settings, for tracking.
+        shift_ns: What was found from motion, and is to be added to stamps.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        poses: PosesNow,
+        delays: Delays,
+        T_body_camera: Transform,
+        config: Config,
+        notify: Callable[[str], None],
+        option: str,
+        given_s: float = 0.0,
+        background: bool = True,
+    ):
+        self.config, self.shift_ns = config, 0
+        self._name, self._poses, self._mount = name, poses, T_body_camera
+        self._notify, self._option, self._given_s = notify, option, given_s
+        self._watch = ClockWatch(delays)
+        self._motion: MotionClock | None = None
+        self._doubt: ClockDoubt | None = None
+        self._told_ns = 0
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="stereovox-clock") if background else None
+        self._seeing: Future[None] | None = None
+        self._failed = ""
+
+    def heard(self, stamp_ns: int, arrived_ns: int) -> ClockDoubt | None:
+        """Take in the stamp of an image, corrected; return the doubt that the image is in, None: its stamp is right."""
+        return self._watch.heard(stamp_ns, arrived_ns)
+
+    def check(self, frame: AnyFrame | Scan, doubt: ClockDoubt | None, now_ns: int) -> None:
+        """Learn from an image, in its turn; raises FrameRefused where its pose is not certain.
+
+        frame: with the stamp that was `heard`. now_ns: monotonic.
+        """
+        if doubt is None:
+            return
+        if doubt is self._watch.doubt:
+            self._learn(frame, doubt, now_ns)
+        if doubt.cleared or (doubt.became not in (LATE, CLOCK) and self._rests(frame.stamp_ns, doubt)):
+            return
+        raise FrameRefused(REASON, f"{name_of(frame)}: {_words(doubt)}, and which is not known; {self._cure(doubt)}")
+
+    def close(self) -> None:
+        """End what runs in the background."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _cure(self, doubt: ClockDoubt) -> str:
+        seconds = self._given_s - (self.shift_ns + doubt.off_ns) / 1e9
+        return f"move the camera until its motion shows it, or begin again with {self._option} {seconds:.3f}"
+
+    def _learn(self, frame: AnyFrame | Scan, doubt: ClockDoubt, now_ns: int) -> None:
+        """Track an image of an open doubt, and end the doubt where its motion says enough; tell the user of both."""
+        if doubt is not self._doubt:
+            self._doubt, self._motion, self._failed, self._told_ns = doubt, None, "", now_ns
+        if not doubt.told and (doubt.announced or now_ns - doubt.since_ns > TELL_NS):
+            doubt.told, self._told_ns = True, now_ns
+            self._notify(f"{self._name}: {_words(doubt)}; images are left out while it moves; {self._cure(doubt)}")
+        elif doubt.told and now_ns - self._told_ns > REMIND_NS:
+            self._told_ns = now_ns
+            why = self._failed or "its motion does not show it"
+            self._notify(f"{self._name}: {_words(doubt)}, and {why}; {self._cure(doubt)}")
+        if isinstance(frame, Cloud | Scan):
+            self._failed = "clouds and scans do not show it"
+            return
+        if self._seeing is not None and not self._seeing.done():
+            return
+        if self._motion is None:
+            self._motion = MotionClock(self.config, self._mount, self._poses)
+        bare = replace(frame, T_world_sensor=np.full((4, 4), np.nan))
+        if self._worker is None:
+            self._see(self._motion, bare, doubt)
+        else:
+            self._seeing = self._worker.submit(self._see, self._motion, bare, doubt)
+
+    def _see(self, motion: MotionClock, frame: AnyFrame, doubt: ClockDoubt) -> None:
+        try:
+            motion.see(frame)
+            low_ns, high_ns = _range(doubt)
+            shift_ns = motion.shift_ns(low_ns, high_ns)
+        except StereovoxError as error:
+            self._failed = str(error)
+            return
+        if shift_ns is None or doubt is not self._watch.doubt:
+            return
+        late = f"by {doubt.off_ns / 1e9:+.2f} s"
+        if abs(shift_ns) <= ALIKE_NS:
+            self._watch.late()
+            self._notify(f"{self._name}: its motion shows that images come later {late}, and stamps are right")
+            return
+        if not doubt.start and abs(shift_ns - doubt.off_ns) <= ALIKE_NS:
+            shift_ns = doubt.off_ns  # arrivals say it more exactly
+        self.shift_ns += shift_ns
+        self._watch.corrected()
+        self._notify(
+            f"{self._name}: its motion shows that its clock is {-shift_ns / 1e9:+.3f} s off that of the poses, "
+            "which is taken off from now on"
+        )
+
+    def _rests(self, stamp_ns: int, doubt: ClockDoubt) -> bool:
+        """Return whether the pose is the same at all times that an image may be of."""
+        low_ns, high_ns = _range(doubt) if doubt.start else Limits(min(doubt.off_ns, 0), max(doubt.off_ns, 0))
+        times = np.linspace(stamp_ns + min(low_ns, 0), stamp_ns + max(high_ns, 0), SAMPLES).astype(np.int64).tolist()
+        try:
+            first, *others = [self._poses.at(time_ns) for time_ns in (stamp_ns, *times)]
+        except FrameRefused:
+            return False
+        return all(
+            metres <= SAME_M and angle <= SAME_RAD
+            for metres, angle in (apart(_numbers(first), _numbers(one)) for one in others)
+        )
+
+
+class Limits(NamedTuple):
+    """Least and most nanoseconds."""
+
+    low_ns: int
+    high_ns: int
+
+
+def _range(doubt: ClockDoubt) -> Limits:
+    """Return what may have to be added to stamps.
+
+    At the start nobody knows how long camera and poses take; later it is zero or what the delay has changed by.
+    """
+    if doubt.start:
+        return Limits(doubt.off_ns - BEFORE_NS, doubt.off_ns + AFTER_NS)
+    return Limits(min(doubt.off_ns, 0) - AFTER_NS, max(doubt.off_ns, 0) + AFTER_NS)
+
+
+def _words(doubt: ClockDoubt) -> str:
+    """Say what is doubted."""
+    seconds, later = abs(doubt.off_ns) / 1e9, doubt.off_ns > 0
+    if doubt.start:
+        clock = f"its clock is {'behind' if later else 'ahead of'} that of the poses"
+        return f"images come {seconds:.2f} s {'later' if later else 'earlier'} than poses of the same time, or {clock}"
+    clock = f"its clock was set {'back' if later else 'ahead'} by this much"
+    return f"images come {seconds:.2f} s {'later' if later else 'earlier'} than before, or {clock}"
+
+
+def _near_each_other(shifts: NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """Return the places of ascending shifts, divided where they leave out a second or more."""
+    return np.split(np.arange(len(shifts)), np.flatnonzero(np.diff(shifts) > 1_000_000_000) + 1)
+
+
+def _squares(T: NDArray[np.float64], rotation: type) -> NDArray[np.float64]:
+    """Return how far motions (N, 4, 4) are from none: (N,) squares, at most CAP."""
+    turns = rotation.from_matrix(T[:, :3, :3]).magnitude() / TURN_RAD
+    ways = np.linalg.norm(T[:, :3, 3], axis=1) / WAY_M
+    return np.minimum(turns**2 + ways**2, CAP)
+
+
+def _numbers(T: Transform) -> tuple[float, ...]:
+    return tuple(T.ravel()[:12].tolist())

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Live cameras meet poses that arrive, and become one map."""
 
+import errno
 import json
 import os
 import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from time import sleep, time_ns
 
 import numpy as np
@@ -27,6 +29,7 @@ from stereovox.opening import open_source
 from stereovox.pose_choice import GIVEN, TRACK
 from stereovox.products.projection import project
 from stereovox.se3 import inverse
+from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.base import Stream
 from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.paced import Paced
@@ -428,6 +431,43 @@ def test_the_command_maps_a_file_of_cameras_and_says_what_became_of_them(tmp_pat
     assert set(result["live"]["latency_ms"]["map"]) == {"median", "p90", "p99", "max"}
     assert "in a browser to see the map grow" in err
     assert "front: 6 images came, 0 dropped" in err
+
+
+def _full(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("step", ["write", "fsync", "replace"])
+def test_what_a_full_disk_kept_from_being_written_is_told_and_the_map_is_kept(step, tmp_path, capsys, monkeypatch):
+    """The disk of the outputs is full, that of the map is not."""
+    other = tmp_path / "full"
+    other.mkdir()
+    if step == "write":
+        monkeypatch.setattr(BagWriter, "depth", _full)
+    real = {"fsync": os.fsync, "replace": Path.replace}
+
+    def fsync(number):
+        return _full() if str(other) in os.readlink(f"/proc/self/fd/{number}") else real["fsync"](number)
+
+    def replace(path, target):
+        return _full() if str(other) in str(path) else real["replace"](path, target)
+
+    monkeypatch.setattr(os, "fsync", fsync if step != "replace" else real["fsync"])
+    monkeypatch.setattr(Path, "replace", replace if step == "replace" else real["replace"])
+    words = ["live", "sim:room?frames=8&image_width=96", "--out", str(tmp_path / "a.svox"), "--set", "voxel_size=0.1"]
+    outputs = {"--record": other / "log.mcap", "--grid": other / "grid.yaml", "--sphere": other / "sphere.png"}
+    status = main([*words, *(str(word) for pair in outputs.items() for word in pair), "--json"])
+    out, err = capsys.readouterr()
+    result = json.loads(out.splitlines()[-1])
+    assert status == 2
+    assert load_map(tmp_path / "a.svox").frames == result["frames"] == 8
+    for name, file in outputs.items():
+        assert not file.exists()
+        failed = [why for why in result["not_written"] if why.startswith(f"{file}:")]
+        assert len(failed) == 1, name
+        assert f"not written: {failed[0]}" in err
+    assert "recorded in" not in err
+    assert "distances all round: " not in err
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = _parse(words)
         result = _module(arguments.command).run(arguments)
         failed = _print_json(result) if arguments.json else 0
-        return failed or (DOUBTED if result.get("doubts") else 0)
+        return failed or (2 if result.get("not_written") else DOUBTED if result.get("doubts") else 0)
     except StereovoxError as error:
         return _fail(" ".join(str(error).split()), 2, words)
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk

@@ -135,13 +135,16 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     say(f"from {latency['since']} of an image to the map: {milliseconds(latency['map'])}")
     say(f"and until the outputs have it: {milliseconds(latency['outputs'])}")
     say(f"{100 * live['cpu_share']:.0f} % of a core for {live['seconds']:.1f} s")
+    failures = result.get("not_written", ())
     for what, file in (("2-D map", arguments.grid), ("distances all round", arguments.sphere)):
-        if file:
+        if file and not any(why.startswith(f"{file}:") for why in failures):
             say(f"{what}: {file}")
     if "obstacle_distances" in live:
         say(f"{live['obstacle_distances']} obstacle distances sent to {arguments.mavlink}")
-    if "recorded" in live:
+    if "recorded" in live and not any(why.startswith(f"{arguments.record}:") for why in failures):
         counts = ", ".join(f"{count} {what}" for what, count in live["recorded"].items()) or "nothing"
         say(f"recorded in {arguments.record}: {counts}")
     say(cells_line(result))
+    for why in failures:
+        say(f"not written: {why}")
     say(f"saved in {arguments.out}; look at it with: {command_line('view', arguments.out)}")

@@ -58,6 +58,10 @@ class GridFile:
         period_s: Seconds between two writes.
         notify: Called with a line where the files could not be written.
 
+    Attributes:
+        written: How often they were.
+        failure: Why the files do not hold the newest 2-D map; "" when they do.
+
     Raises:
         StereovoxError: The file cannot be written, or the map is not level.
     """
@@ -75,7 +79,7 @@ class GridFile:
         self._worker = ThreadPoolExecutor(1, "stereovox-grid")
         self._busy: Future[None] | None = None
         self._due, self._new = 0.0, False
-        self.written = 0
+        self.written, self.failure = 0, ""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
         """Write the 2-D map if that is due and the last write is done."""
@@ -100,17 +104,26 @@ class GridFile:
         try:
             grid = self._projection.grid()
         except StereovoxError as error:
-            self._notify(f"{self._file}: {error}")
+            self._fail(str(error))
             return
         if grid is not None:
             self._busy = self._worker.submit(self._save, grid)
+        elif not self.written:
+            self.failure = f"{self._file}: nothing is known between these heights; no 2-D map is written"
 
     def _save(self, grid: OccupancyGrid) -> None:
         try:
             write_map_server(grid, self._file)
-            self.written += 1
+            self.written, self.failure = self.written + 1, ""
         except StereovoxError as error:
-            self._notify(str(error))
+            self._fail(str(error))
+
+    def _fail(self, why: str) -> None:
+        """Tell the user once of each thing that is wrong: a full disk is, every second."""
+        why = why if why.startswith(f"{self._file}:") else f"{self._file}: {why}"
+        if why != self.failure:
+            self._notify(why)
+        self.failure = why
 
 
 class LiveSphere:
@@ -120,6 +133,9 @@ class LiveSphere:
         config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees where they say nothing.
         mounts: T_body_camera (4, 4) by the name of the sensor; body x forward, y left, z up.
         picture: PNG to draw at the end; None: none.
+
+    Attributes:
+        failure: Why there is no picture, where one was asked for; "" when there is.
 
     Raises:
         StereovoxError: The picture cannot be written.
@@ -131,6 +147,7 @@ class LiveSphere:
         self._layout = SphereLayout.configured(self._config.sphere)
         self._mounts, self._pipeline = mounts, DepthPipeline(self._config)
         self._last: dict[str, tuple[SphereGrid, Transform]] = {}
+        self.failure = ""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
         """Take in what a camera sees, unless the map refused it; clouds of lidars are left out."""
@@ -162,12 +179,16 @@ class LiveSphere:
         return together(self._last)
 
     def finish(self) -> None:
-        """Draw the picture."""
-        if self._picture is not None and self._last:
-            from stereovox.view.sphere import sphere_picture
+        """Draw the picture; `failure` says why it could not be written."""
+        if self._picture is None:
+            return
+        from stereovox.view.sphere import sphere_picture
 
+        try:
             grid, now_ns = self.grid()
             sphere_picture(grid, self._picture, now_ns=now_ns)
+        except StereovoxError as error:
+            self.failure = f"{self._picture}: no picture is written ({error})"
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""

@@ -49,6 +49,7 @@ class Recorder:
     Attributes:
         counts: `images` that are recorded, `skipped`: that came while too many waited, `unsuitable`: other than whole
             depth images.
+        failure: Why the recording is not at `file`, and where what was recorded before is; "" while nothing is wrong.
 
     Raises:
         StereovoxError: The file has another ending, or cannot be written.
@@ -65,7 +66,7 @@ class Recorder:
             raise StereovoxError(f"{file}: end the name of a recording in {' or '.join(ENDINGS)}")
         if len({topic(name) for name in mounts}) < len(mounts):
             raise StereovoxError(f"{file}: cameras {', '.join(mounts)} have one topic; name them by letters and digits")
-        self.file, self.counts = Path(file), Counter[str]()
+        self.file, self.counts, self.failure = Path(file), Counter[str](), ""
         self._mounts, self._imus, self._notify = mounts, imus or {}, notify
         self._heard: dict[str, int] = {}
         self._pictured: set[str] = set()
@@ -113,9 +114,11 @@ class Recorder:
                 self._bag.complete()
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
+                self.failure = f"{self.file}: no image came that could be recorded; nothing is recorded"
         except Exception as error:  # whatever it is, the user is told, and nobody waits for this thread
             why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
-            self._notify(f"{why}; {self._left()}, mapping goes on")
+            self.failure = f"{why}; {self._left()}"
+            self._notify(f"{self.failure}, mapping goes on")
             self._drain()
 
     def _left(self) -> str:

@@ -49,6 +49,7 @@ class LiveResult:
         stopped: Whether a signal ended it (Ctrl-C, SIGTERM or SIGHUP), as is usual.
         live: Latency, images and poses by where they came from, and outputs: the part `live` of `summary`.
         poses: `given`, `track`, or the name of the stream of poses.
+        failures: What was to be written beside the map and is not, a line each.
     """
 
     map: VoxelMap
@@ -57,14 +58,17 @@ class LiveResult:
     stopped: bool
     live: dict[str, Any]
     poses: str
+    failures: Sequence[str] = ()
 
     def summary(self) -> dict[str, Any]:
         """Summarise the run.
 
         Returns:
-            The numbers of `stereovox live --json`: those of `map`, and `live`.
+            The numbers of `stereovox live --json`: those of `map`, and `live`; `not_written` where something was to be
+            and is not.
         """
-        return {**summarise(self.map, self.reports), "poses": self.poses, "live": self.live}
+        found = {**summarise(self.map, self.reports), "poses": self.poses, "live": self.live}
+        return {**found, "not_written": list(self.failures)} if self.failures else found
 
 
 def map_live(
@@ -262,10 +266,12 @@ class LiveRun:
                 stopped = True
             finally:
                 seconds, cpu = perf_counter() - begin, process_time() - cpu
-                for output in (*outputs, *self._page):
-                    getattr(output, "finish", _nothing)()
-                for output in outputs:
-                    getattr(output, "close", _nothing)()
+                with ExitStack() as ends:  # one that fails does not keep the others from their end
+                    for output in (*outputs, *self._page)[::-1]:
+                        ends.callback(getattr(output, "close", _nothing) if output in outputs else _nothing)
+                    for output in (*outputs, *self._page)[::-1]:
+                        ends.callback(getattr(output, "finish", _nothing))
+        failures = [why for output in self.outputs if (why := getattr(output, "failure", ""))]
         if not self.mapper.map.frames:
             raise StereovoxError(f"{self.stream.name}: stopped before an image could be mapped, no map is written")
         live = {
@@ -278,8 +284,9 @@ class LiveRun:
         if self._sender is not None:
             live["obstacle_distances"] = self._sender.sent
         if self._recorder is not None:
-            live["recorded"] = dict(self._recorder.counts)
-        return LiveResult(self.mapper.map, self.out, reports.reports, stopped, live, self._poses_word())
+            failed = {"failure": self._recorder.failure} if self._recorder.failure else {}
+            live["recorded"] = {**self._recorder.counts, **failed}
+        return LiveResult(self.mapper.map, self.out, reports.reports, stopped, live, self._poses_word(), failures)
 
     def _obstacle_sender(self, url: str) -> ObstacleSender:
         """Return what tells an autopilot of obstacles, over the connection that brings its poses if it is the same."""

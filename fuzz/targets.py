@@ -46,6 +46,7 @@ from stereovox.maps import VoxelMap, load_map, save_boxed
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_source
+from stereovox.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.sources import images
 from stereovox.sources.calibration_files import import_rig
 from stereovox.sources.camera_file import find_camera, read_camera
@@ -207,15 +208,21 @@ def read_manifest(data: bytes, folder: Path) -> None:
     path = saved(folder)
     whole = (path / "manifest.json").read_bytes()
     try:
-        (path / "manifest.json").write_bytes(data.replace(b"DATA", json.loads(whole)["data"].encode()))
+        (path / "manifest.json").write_bytes(_resealed(data.replace(b"DATA", unsealed(whole)["data"].encode())))
         load_map(path)
     finally:
         (path / "manifest.json").write_bytes(whole)
 
 
 def manifests(folder: Path) -> list[bytes]:
-    text = (saved(folder) / "manifest.json").read_text()
-    return [text.replace(json.loads(text)["data"], "DATA").encode()]
+    whole = (saved(folder) / "manifest.json").read_bytes()
+    return [whole.replace(unsealed(whole)["data"].encode(), b"DATA")]
+
+
+def _resealed(data: bytes) -> bytes:
+    """Give a damaged manifest the digest of what it is now, so that what reads it gets to see the damage."""
+    begun = SEAL.match(data)
+    return data if begun is None else b'{"digest": "%s", ' % _digest(data[begun.end() :]) + data[begun.end() :]
 
 
 PIECES = ("coords/zarr.json", "coords/c/0/0", "cells/zarr.json", "cells/c/0/0", "zarr.json")
@@ -242,8 +249,8 @@ def read_cells(data: bytes, folder: Path) -> None:
     coords = np.frombuffer(data[: len(data) // 12 * 12], "<i4").reshape(-1, 3)
     cells = np.resize(np.frombuffer(data or b"\0", np.uint8), (len(coords), 512)).astype(np.int16) * 131
     path = saved(folder)
-    manifest = json.loads((path / "manifest.json").read_text())
-    whole = json.dumps(manifest)
+    whole = (path / "manifest.json").read_bytes()
+    manifest = unsealed(whole)
     manifest |= {"data": "cells-made", "blocks": len(coords), "checksum": [zlib.crc32(coords), zlib.crc32(cells)]}
     for name, array in (("coords", coords), ("cells", cells)):
         told = json.loads((next(path.glob("cells-[0-9a-f]*")) / name / "zarr.json").read_text())
@@ -252,11 +259,11 @@ def read_cells(data: bytes, folder: Path) -> None:
         (path / "cells-made" / name / "zarr.json").write_text(json.dumps(told | {"shape": array.shape}))
         (path / "cells-made" / name / "c/0/0").write_bytes(Zstd().encode(array.tobytes()))
     try:
-        (path / "manifest.json").write_text(json.dumps(manifest))
+        (path / "manifest.json").write_bytes(sealed(manifest))
         loaded = load_map(path)
         assert len(loaded.storage.blocks()[0]) <= len(coords)
     finally:
-        (path / "manifest.json").write_text(whole)
+        (path / "manifest.json").write_bytes(whole)
 
 
 def boxed(folder: Path) -> Path:
@@ -275,7 +282,7 @@ def read_boxed(data: bytes, folder: Path) -> None:
     path = boxed(folder) / "manifest.json"
     whole = path.read_bytes()
     try:
-        path.write_bytes(data)
+        path.write_bytes(_resealed(data))
         loaded = load_map(path.parent)
         loaded.storage.blocks()
         loaded.overview(100)
@@ -293,13 +300,13 @@ def read_shard(data: bytes, folder: Path) -> None:
     files = sorted(boxed(folder).glob("boxes/0/*/*/c/0/0"))
     file, path = files[data[0] % len(files) if data else 0], boxed(folder) / "manifest.json"
     whole, manifest = file.read_bytes(), path.read_bytes()
-    told = json.loads(manifest)
+    told = unsealed(manifest)
     entry = next(one for one in told["boxes"] if one["name"].endswith(file.parts[-5]))
     entry["checksum"][("coords", "cells").index(file.parts[-4])] = zlib.crc32(data[1:])
     entry["bytes"] += len(data)
     try:
         file.write_bytes(data[1:])
-        path.write_text(json.dumps(told))
+        path.write_bytes(sealed(told))
         load_map(path.parent).storage.blocks()
     finally:
         file.write_bytes(whole)
@@ -324,7 +331,7 @@ def grids(folder: Path) -> list[bytes]:
 
 def read_about(data: bytes, folder: Path) -> None:
     coords, cells = small_grid().storage.tiles()
-    np.savez_compressed(folder / "b.npz", about=np.frombuffer(data, np.uint8), coords=coords, cells=cells)
+    np.savez_compressed(folder / "b.npz", about=np.frombuffer(_resealed(data), np.uint8), coords=coords, cells=cells)
     load_grid(folder / "b.npz")
 
 

@@ -7,6 +7,7 @@ First the writing (`check_file`, `replacing`, `sync_*`), then the reading of tex
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import json
 import math
@@ -17,7 +18,7 @@ import stat
 import tomllib
 import uuid
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -52,6 +53,8 @@ MAX_NODES = 100_000
 """Most values in a YAML file, each counted as often as aliases repeat it."""
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of what zstd packs."""
+SEAL = re.compile(rb'{"digest": "([0-9a-f]{32})", ')
+"""Begins what `sealed` makes."""
 MAX_NUMBER = 1e300
 """Bound of numbers in settings: TOML's integers are unbounded, floats are not."""
 
@@ -198,6 +201,29 @@ def json_value(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+def sealed(values: Mapping[str, Any], default: Callable[[Any], Any] | None = None, indent: int | None = None) -> bytes:
+    """Return values as a JSON object that begins with a digest of all that follows, so that any damage is noticed.
+
+    default: converts what JSON does not know, as in `json.dumps`.
+    """
+    body = json.dumps(values, default=default, indent=indent).encode()[1:]
+    return b'{"digest": "%s", ' % _digest(body) + body
+
+
+def unsealed(data: bytes) -> dict[str, Any]:
+    """Return the values of `sealed`, without the digest. Raises ValueError, one line, for damage."""
+    begun = SEAL.match(data)
+    if begun is None:
+        raise ValueError("it does not begin with a digest")
+    if begun[1] != _digest(data[begun.end() :]):
+        raise ValueError("it does not match its digest")
+    return json_value(b"{" + data[begun.end() :])
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).hexdigest().encode()
 
 
 def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps in boxes answer as maps in memory do, whatever the cache holds, from folders and from object stores."""
 
-import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from uuid import uuid4
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from made_manifest import manifest_in, put_manifest
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import boxed_manifest, boxed_map
 from stereovox.maps.boxed_manifest import only_writer_at, read_boxed_manifest
@@ -255,8 +255,7 @@ def test_damage_is_told_by_the_box(where):
 )  # fmt: skip
 def test_a_damaged_manifest_is_one_line(saved, tmp_path, change):
     (tmp_path / "m.svox").mkdir()
-    text = json.dumps({**json.loads((saved / "manifest.json").read_text()), **change})
-    (tmp_path / "m.svox/manifest.json").write_text(text)
+    put_manifest(tmp_path / "m.svox/manifest.json", {**manifest_in(saved / "manifest.json"), **change})
     with pytest.raises(MapFileError) as error:
         sv.load_map(tmp_path / "m.svox")
     assert "\n" not in str(error.value)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When cells were seen last, and that they are forgotten, against a dictionary of cells."""
 
-import json
 import shutil
 
 import made_flights as made
@@ -206,21 +205,6 @@ def test_times_are_saved_and_checked(tmp_path):
     shutil.rmtree(data / "times")
     with pytest.raises(MapFileError, match="damaged map"):
         load_map(tmp_path / "m")
-
-
-def test_a_map_from_before_there_were_times_still_opens(tmp_path):
-    one = made.fly(VoxelMap(load_config(voxel_size=0.1)), made.flight(3, 3))
-    one.save(tmp_path / "m")
-    manifest = json.loads((tmp_path / "m" / "manifest.json").read_text())
-    for key in ("confirm_hits", "keep_times", "forget_s"):
-        del manifest["config"]["map"][key]
-    del manifest["times_start_ns"]
-    assert len(manifest["checksum"]) == 2
-    (tmp_path / "m" / "manifest.json").write_text(json.dumps(manifest))
-    again = load_map(tmp_path / "m")
-    made.assert_same(again, one)
-    with pytest.raises(ConfigError, match="cannot go on"):
-        make_map(settings(), again)
 
 
 @pytest.mark.parametrize("placed", [True, False])

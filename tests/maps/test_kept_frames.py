@@ -12,6 +12,7 @@ import pytest
 from naive_packing import split
 
 import stereovox as sv
+from made_manifest import manifest_in, put_manifest
 from stereovox.cameras.pinhole import DepthCorrection
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.maps import _packing, frame_store
@@ -256,17 +257,17 @@ def folder(tmp_path):
 
 
 def index_of(folder):
-    name = json.loads((folder / "manifest.json").read_text())["kept_frames"]["index"]
+    name = manifest_in(folder / "manifest.json")["kept_frames"]["index"]
     return folder / name, json.loads((folder / name).read_text())
 
 
 def put_index(folder, index):
     """Write an index under the name that its content asks for, as an attacker would."""
     content = json.dumps(index).encode()
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = manifest_in(folder / "manifest.json")
     manifest["kept_frames"]["index"] = frame_store._name(content)
     (folder / frame_store._name(content)).write_bytes(content)
-    (folder / "manifest.json").write_text(json.dumps(manifest))
+    put_manifest(folder / "manifest.json", manifest)
 
 
 @pytest.mark.parametrize(
@@ -301,9 +302,9 @@ def test_an_index_of_a_stranger_is_refused_in_one_line(folder, change):
 
 
 def test_names_of_frames_lead_nowhere_else(folder):
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = manifest_in(folder / "manifest.json")
     manifest["kept_frames"]["packs"] = ["frames-../../x"]
-    (folder / "manifest.json").write_text(json.dumps(manifest))
+    put_manifest(folder / "manifest.json", manifest)
     with pytest.raises(MapFileError, match="damaged map"):
         sv.load_map(folder)
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A rolling map that goes on with another, is asked before its first frame, or asked about what lies in its tiles."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 
+from made_manifest import manifest_in, put_manifest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MapFileError
@@ -154,9 +154,9 @@ def damaged(**keys):
 )
 def test_a_damaged_window_is_one_line_and_leaves_no_tiles(tmp_path, damage):
     earlier = moved(tmp_path / "m", "keep")
-    manifest = json.loads((tmp_path / "m" / "manifest.json").read_text())
+    manifest = manifest_in(tmp_path / "m" / "manifest.json")
     manifest["window"] = damage(manifest["window"])
-    (tmp_path / "m" / "manifest.json").write_text(json.dumps(manifest))
+    put_manifest(tmp_path / "m" / "manifest.json", manifest)
     with pytest.raises(ConfigError, match="the map's window is damaged") as caught:
         make_map(earlier.config, load_map(tmp_path / "m"), tmp_path / "tiles")
     assert "\n" not in str(caught.value)

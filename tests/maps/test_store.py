@@ -12,6 +12,7 @@ from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap, load_map, store
 from stereovox.maps.storage import Storage
+from stereovox.safe_io import sealed, unsealed
 
 CONFIG = load_config(voxel_size=0.1)
 CAMERA = PinholeCamera.from_field_of_view(64, 48, 90, 0.05)
@@ -86,14 +87,14 @@ def test_slabs_of_any_size_are_saved_in_whole_chunks(tmp_path, monkeypatch):
 
 
 def changed(**keys):
-    return lambda manifest: json.dumps({**json.loads(manifest), **keys})
+    return lambda manifest: sealed({**unsealed(manifest), **keys})
 
 
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda text: text.replace('"frames": 0', '"frames": 1e400'),
-        lambda text: "[" * 200_000,
+        lambda data: data.replace(b'"frames": 0', b'"frames": 1e400'),
+        lambda data: b"[" * 200_000,
         changed(config="default"),
         changed(config=None),
         changed(config=[["voxel_size", 0.1]]),
@@ -107,9 +108,9 @@ def changed(**keys):
 def test_a_damaged_manifest_is_one_line(tmp_path, damage):
     small_map().save(tmp_path / "m")
     manifest = tmp_path / "m" / "manifest.json"
-    before = manifest.read_text()
-    manifest.write_text(damage(before))
-    assert manifest.read_text() != before
+    before = manifest.read_bytes()
+    manifest.write_bytes(damage(before))
+    assert manifest.read_bytes() != before
     with pytest.raises(MapFileError, match=r"make .* anew") as caught:
         load_map(tmp_path / "m")
     assert "\n" not in str(caught.value)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import NamedTuple
@@ -21,7 +20,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.pyramid import coarser_layout, families, names_of
 from stereovox.maps.store import MANIFEST
 from stereovox.places import Place
-from stereovox.safe_io import json_value
+from stereovox.safe_io import sealed, unsealed
 
 DONE = "done"
 """Folder of the entries of boxes that no manifest names yet, by what they are made of."""
@@ -100,7 +99,7 @@ def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
                 storage.look_from(image.viewpoint)
                 storage.add(_within(level.integrator.evidence(image), low, high))
     done = DoneBox(write_box(place, layout, box.at, storage), perf_counter() - started)
-    place.write(f"{DONE}/{box.inputs(layout)}.json", json.dumps(saved(done)).encode())
+    place.write(f"{DONE}/{box.inputs(layout)}.json", sealed({"done": saved(done)}))
     return done
 
 
@@ -165,7 +164,7 @@ def _done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None
     """Return a box that a run before has mapped from the same frames, None where there is none."""
     data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
     try:
-        return None if data is None else loaded(json_value(data), layout)
+        return None if data is None else loaded(unsealed(data)["done"], layout)
     except (KeyError, TypeError, ValueError):
         return None  # it is mapped again
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -46,7 +45,7 @@ from stereovox.opening import open_source
 from stereovox.places import Place
 from stereovox.products.merge import together
 from stereovox.run import SURVEYED, ended_in_order
-from stereovox.safe_io import json_value
+from stereovox.safe_io import sealed, unsealed
 from stereovox.survey import PICTURES_UPRIGHT, survey
 from stereovox.trust.history import History
 
@@ -152,7 +151,7 @@ def map_fleet(
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
         keys = {one: one.key(layout) for one in listed}  # once: files may change meanwhile
         with cluster(scheduler, workers, notify) as run:
-            place.write(SETTINGS, json.dumps(_settings(layout)).encode())
+            place.write(SETTINGS, sealed(_settings(layout)))
             reports = _indexed(run, place, keys, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
@@ -263,7 +262,7 @@ def _known_layout(place: Place) -> BoxLayout | None:
     """Return settings and boxes of a run before; None where there was none."""
     known = place.find(SETTINGS, MAX_SETTINGS)
     try:
-        values = None if known is None else json_value(known)
+        values = None if known is None else unsealed(known)
         return None if values is None else BoxLayout(load_config(values["config"]), values["side"])
     except (KeyError, TypeError, ValueError, StereovoxError) as error:
         raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); choose another name for the map") from None

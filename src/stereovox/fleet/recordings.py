@@ -39,7 +39,7 @@ from stereovox.places import Bucket, Folder, NoBucketError, Place, is_url
 from stereovox.pose_choice import GIVEN
 from stereovox.remapping import remap
 from stereovox.run import MapRun
-from stereovox.safe_io import json_value
+from stereovox.safe_io import sealed, unsealed
 from stereovox.sources.bags.recording import file_part
 
 VERSION = 2
@@ -148,7 +148,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
             made, seen = _mapped_alone(recording, layout, Path(folder), notes)
         except Exception as error:
             return RecordingReport(recording.where, error=why_not(recording, error, Path(folder)), notes=notes)
-        manifest = json_value((made / MANIFEST).read_bytes())
+        manifest = unsealed((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
             home.write(name, (made / name).read_bytes())
         numbers = np.repeat(np.arange(len(seen)), [len(boxes) for boxes in seen])
@@ -156,10 +156,10 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
         array = io.BytesIO()
         np.save(array, rows)
         manifest["seen"] = digest_of(array.getvalue())
-        home.write_all({MANIFEST: json.dumps(manifest).encode(), SEEN: array.getvalue()})
+        home.write_all({MANIFEST: sealed(manifest), SEEN: array.getvalue()})
         refused = {str(why): int(number) for why, number in manifest["history"]["refused"].items()}
     report = RecordingReport(recording.where, len(seen), refused, perf_counter() - started, notes=notes)
-    home.write(REPORT, json.dumps(report.summary()).encode())
+    home.write(REPORT, sealed(report.summary()))
     return report
 
 
@@ -195,7 +195,7 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
     """Return the report of a recording that was indexed before, None where it was not."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
     try:
-        return None if saved is None else RecordingReport(**{**json_value(saved), "seconds": 0.0})
+        return None if saved is None else RecordingReport(**{**unsealed(saved), "seconds": 0.0})
     except (TypeError, ValueError):
         return None  # it is mapped again
 
@@ -215,7 +215,7 @@ def manifest_of(place: Place, key: str) -> dict[str, Any]:
     """Return the manifest of the map that a recording made alone. Raises MapFileError where it is damaged."""
     data = (place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST)
     try:
-        manifest = json_value(data)
+        manifest = unsealed(data)
         files_of_frames(manifest["kept_frames"])
     except (KeyError, TypeError, ValueError) as error:
         raise _damaged(place, key, error) from None

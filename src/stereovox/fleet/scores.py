@@ -28,7 +28,7 @@ from stereovox.opening import open_source
 from stereovox.places import Place
 from stereovox.pose_choice import GIVEN
 from stereovox.run import MapRun, ended_in_order
-from stereovox.safe_io import json_value
+from stereovox.safe_io import sealed, unsealed
 
 VERSION = 2
 """Of what is kept of a score; another one is made anew."""
@@ -206,7 +206,7 @@ def score_recording(
                 row = RecordingScore(recording.where, config.profile, error=why)
             rows[key] = replace(row, seconds=perf_counter() - started)
             if not row.error:  # what failed is tried again
-                (place / "scores").write(f"{key}.json", json.dumps(asdict(rows[key])).encode())
+                (place / "scores").write(f"{key}.json", sealed(asdict(rows[key])))
     return rows
 
 
@@ -251,7 +251,7 @@ def _keys(recording: Recording, configs: Sequence[Config], options: ScoreOptions
 def _scored_before(place: Place, key: str) -> RecordingScore | None:
     saved = (place / "scores").find(f"{key}.json", MAX_ROW)
     try:
-        return None if saved is None else RecordingScore(**json_value(saved))
+        return None if saved is None else RecordingScore(**unsealed(saved))
     except (TypeError, ValueError):
         return None  # damaged: it is scored again
 

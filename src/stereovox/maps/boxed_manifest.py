@@ -7,7 +7,6 @@ names belong to writers that were killed, or to older maps; the next writer swee
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -23,13 +22,13 @@ from stereovox.frame import Viewpoint
 from stereovox.maps.boxes import BOXES, BoxEntry, BoxLayout
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.pyramid import coarser_layout
-from stereovox.maps.store import FORMAT, MANIFEST, as_number, viewpoint_from, viewpoint_to
+from stereovox.maps.store import FORMAT, MANIFEST, as_number, manifest_from, viewpoint_from, viewpoint_to
 from stereovox.places import Folder, Place
-from stereovox.safe_io import json_value
+from stereovox.safe_io import sealed
 from stereovox.trust.history import History
 
-VERSION = 3
-"""Of the manifest: maps in one piece have 1 and 2."""
+VERSION = 5
+"""Of the manifest; that of maps in one piece is another."""
 MAX_MANIFEST = 1 << 27
 """Bytes of a manifest; a box takes about 300."""
 MAX_LEVELS = 24
@@ -88,7 +87,7 @@ def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
         "levels": [[entry.saved() for entry in sorted(level)] for level in manifest.levels],
         "extra": manifest.extra,
     }
-    data = json.dumps(saved, default=as_number).encode()
+    data = sealed(saved, as_number)
     if len(data) > MAX_MANIFEST:
         raise MapFileError(f"{place}: a manifest of {len(manifest.boxes)} boxes is too large; choose larger boxes")
     place.write(MANIFEST, data)
@@ -99,16 +98,7 @@ def read_boxed_manifest(place: Place) -> BoxedManifest:
     data = place.find(MANIFEST, MAX_MANIFEST)
     if data is None:
         raise MapFileError(f"{place}: no stereovox map here (no {MANIFEST}); check the name")
-    try:
-        saved = json_value(data)
-    except ValueError as error:
-        raise MapFileError(f"{place}/{MANIFEST}: cannot be read ({error}); make the map anew") from None
-    if not isinstance(saved, dict) or saved.get("format") != FORMAT:
-        raise MapFileError(f"{place}/{MANIFEST}: not a stereovox map")
-    if saved.get("version") != VERSION:
-        raise MapFileError(
-            f"{place}: map format {saved.get('version')}, maps in boxes have {VERSION}; update stereovox"
-        )
+    saved = manifest_from(data, VERSION, f"{place}/{MANIFEST}")
     try:
         return _manifest_of(saved)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:

@@ -197,7 +197,7 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera | Lidar], pack: Path
         raise ValueError("a kept frame is of no kind that is known")
     if blocks.shape != (2, 3) or len(pose) != 12 or count_in(saved, "camera") >= len(cameras):
         raise ValueError("a kept frame has no place or no camera")
-    turn, shift = _numbers(saved.get("pose_sigma", (0, 0)))  # maps from before have none
+    turn, shift = _numbers(saved["pose_sigma"])
     content, camera = InFile((pack, start), size, str(saved["digest"])), cameras[saved["camera"]]
     return KeptFrame(
         count_in(saved, "number"), str(saved["sensor"]), str(saved["name"]), int(saved["stamp_ns"]),

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import json
+import zlib
 from math import isclose
 from operator import attrgetter
 from pathlib import Path
@@ -24,11 +24,11 @@ from stereovox.maps.memory import format_bytes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.queries import INDEX_LIMIT, points_of, shape_error
 from stereovox.maps.storage import OnStorage
-from stereovox.safe_io import json_value, read_arrays, replacing
+from stereovox.safe_io import read_arrays, replacing, sealed, unsealed
 from stereovox.threads import Guarded, MapLock
 from stereovox.trust.history import History
 
-FORMAT, VERSION = "stereovox-grid", 1
+FORMAT, VERSION = "stereovox-grid", 2
 PARTS = ("about", "coords", "cells")
 MAX_PICTURED = 2**29
 """Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
@@ -379,7 +379,7 @@ def save_grid(grid_map: GridMap, path: str | Path) -> None:
     Raises MapFileError, one line, where that cannot be or another run is writing it.
     """
     coords, cells = grid_map.storage.tiles()
-    about = np.frombuffer(json.dumps(_about(grid_map)).encode(), np.uint8)
+    about = np.frombuffer(sealed({**_about(grid_map), "checksum": _checksums(coords, cells)}), np.uint8)
     with only_writer_of(Path(path)), replacing(path) as file:
         np.savez_compressed(file, about=about, coords=coords, cells=cells)
 
@@ -388,7 +388,7 @@ def load_grid(path: str | Path) -> GridMap:
     """Read a grid saved by `GridMap.save`. Raises MapFileError: one line with the file and what is wrong."""
     try:
         parts = read_arrays(path, PARTS, "grid; make one with GridMap.save")
-        about = json_value(parts["about"].tobytes())
+        about = unsealed(parts["about"].tobytes())
         if about["format"] != FORMAT or about["version"] != VERSION:
             raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
         grid_map = GridMap(load_config(about["config"]), about["origin"])
@@ -402,6 +402,8 @@ def load_grid(path: str | Path) -> GridMap:
             raise ValueError("tiles or origin out of range")
         if not (cells != grid_map.storage.cell_format.unknown).any(axis=1).all():
             raise ValueError("a tile without a known cell")
+        if _checksums(coords, cells) != about["checksum"]:
+            raise ValueError("the cells do not match their checksum")
         grid_map.storage.insert(coords, cells)
     except MapFileError:
         raise
@@ -411,6 +413,10 @@ def load_grid(path: str | Path) -> GridMap:
         why = " ".join(str(error).split()) or type(error).__name__
         raise MapFileError(f"{path}: no grid that can be read ({why}); save it anew") from None
     return grid_map
+
+
+def _checksums(*arrays: NDArray[Any]) -> list[int]:
+    return [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays]
 
 
 def _about(grid_map: GridMap) -> dict[str, Any]:

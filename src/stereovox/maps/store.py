@@ -13,7 +13,6 @@ nothing is allocated for what is not there.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import shutil
@@ -41,7 +40,17 @@ from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.maps.storage import Storage
 from stereovox.places import Place, is_url
-from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree, zstd_size
+from stereovox.safe_io import (
+    count_in,
+    json_value,
+    read_bounded,
+    sealed,
+    shown,
+    sync_folder,
+    sync_tree,
+    unsealed,
+    zstd_size,
+)
 from stereovox.trust.history import History
 
 ARRAYS = ("coords", "cells", "times")
@@ -52,9 +61,9 @@ SMALL, PACKED_BEST = 1 << 24, 100
 """Coordinates may unpack to so many bytes, or to so many for each of theirs on disk."""
 BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian": "little"}}
 FORMAT = "stereovox-map"
-VERSION, READABLE = 2, (1, 2)
+VERSION = 4
 MANIFEST = "manifest.json"
-BOXED = b'"format": "stereovox-map", "version": 3,'
+BOXED = b'"format": "stereovox-map", "version": 5,'
 """Begins the manifest of a map in boxes."""
 MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
@@ -154,17 +163,15 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
     try:
         if not isinstance(manifest["config"], dict):
             raise TypeError("config is no table of settings")
-        if isinstance(cells_of := manifest["config"].get("map"), dict):
-            cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         config, history = load_config(manifest["config"]), History.loaded(manifest)
-        viewpoint, window = viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
-        start_ns = _start_ns(manifest.get("times_start_ns"))
+        viewpoint, window = viewpoint_from(manifest["viewpoint"]), manifest["window"]
+        start_ns = _start_ns(manifest["times_start_ns"])
         data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
         dtypes = [FORMATS[config.map.cell].dtype, np.dtype(np.uint32)][: 2 if config.map.keep_times else 1]
         coords, cells, *times = arrays = read_blocks(data, blocks, *dtypes)
-        if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
+        if _checksums(arrays) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
-        kept = read_frames(folder, manifest.get("kept_frames"), config.map.frames_budget)
+        kept = read_frames(folder, manifest["kept_frames"], config.map.frames_budget)
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns, kept)
@@ -294,20 +301,36 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if (folder / MANIFEST).is_symlink():
         raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
     try:
-        manifest = json_value(read_bounded(folder / MANIFEST, MAX_MANIFEST))
+        manifest = manifest_from(read_bounded(folder / MANIFEST, MAX_MANIFEST), VERSION, str(folder / MANIFEST))
     except OSError as error:
         reason = error.strerror or error
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({reason}); check that you may read it") from None
-    except ValueError as error:
-        raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
-    if manifest.get("version") not in READABLE:
-        raise MapFileError(
-            f"{folder}: map format {manifest.get('version')}, this program reads {VERSION}; update stereovox"
-        )
     if "/" in str(manifest.get("data")) or ".." in str(manifest.get("data")):
         raise MapFileError(f"{folder / MANIFEST}: data '{manifest['data']}' points outside the map")
+    return manifest
+
+
+def manifest_from(data: bytes, version: int, where: str) -> dict[str, Any]:
+    """Return the manifest in a file. Raises MapFileError, one line, for damage, other files and other versions."""
+    try:
+        return _of_version(unsealed(data), version, where)
+    except ValueError as error:
+        why = error
+    try:
+        _of_version(json_value(data), version, where)  # what is no manifest, or an older one, has no digest
+    except ValueError as error:
+        why = error
+    raise MapFileError(f"{where}: damaged map ({why}); make it anew")
+
+
+def _of_version(manifest: Any, version: int, where: str) -> dict[str, Any]:
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise MapFileError(f"{where}: not a stereovox map")
+    if manifest.get("version") != version:
+        found = shown(manifest.get("version"))
+        raise MapFileError(
+            f"{where}: map format {found}, this program reads {version}; make the map anew or update stereovox"
+        )
     return manifest
 
 
@@ -360,11 +383,8 @@ def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> 
     }
 
 
-def _checksums(arrays: Slab, wanted: Any) -> int | list[int]:
-    """Zarr reads a chunk whose file is gone as empty cells; these numbers tell. Version 1 had one for both arrays."""
-    if isinstance(wanted, int):
-        coords, cells = (np.ascontiguousarray(array).data for array in arrays)
-        return zlib.crc32(cells, zlib.crc32(coords))
+def _checksums(arrays: Slab) -> list[int]:
+    """Return a number for each array. Zarr reads a chunk whose file is gone as empty cells; these tell."""
     return [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays]
 
 
@@ -394,8 +414,8 @@ def viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     temporary = folder / f".{MANIFEST}.new"
-    with temporary.open("w") as file:
-        json.dump(manifest, file, indent=2, default=as_number)
+    with temporary.open("wb") as file:
+        file.write(sealed(manifest, as_number, indent=2))
         file.flush()
         os.fsync(file.fileno())
     sync_folder(folder)  # whatever the new manifest names is there before it

@@ -22,8 +22,6 @@ MAX_SENSORS = 64
 MAX_REASONS = 256
 """Reasons that refusals are counted by; further ones count as OTHERS."""
 OTHERS = "others"
-NOT_RECORDED = "not_told"
-"""Reason for the refusals in old maps that saved only their number."""
 MAX_NAME_LENGTH = 256
 MAX_NOTES = 16
 """Notes about an imported file."""
@@ -194,7 +192,7 @@ class History:
 
     @classmethod
     def loaded(cls, saved: dict[str, Any]) -> History:
-        """Return the history in a saved manifest; the oldest maps have counts only.
+        """Return the history in a saved manifest.
 
         Raises KeyError, TypeError or ValueError for what cannot have been saved.
         """
@@ -202,16 +200,13 @@ class History:
         history = cls(
             frames,
             recording=one_line(str(saved["recording"])),
-            last_frame=_last_frame_from(saved.get("last_frame")),
-            path=_path_from(saved.get("camera_path")),
-            imported=_imported_from(saved.get("imported")),
-            loops=None if saved.get("loops") is None else LoopLines.loaded(saved["loops"]),
-            recordings=_whole(saved.get("recordings", 1), "recordings", 1),
+            last_frame=_last_frame_from(saved["last_frame"]),
+            path=_path_from(saved["camera_path"]),
+            imported=_imported_from(saved["imported"]),
+            loops=None if saved["loops"] is None else LoopLines.loaded(saved["loops"]),
+            recordings=_whole(saved["recordings"], "recordings", 1),
         )
-        entries = saved.get("history")
-        if entries is None:
-            history.refused = Counter({NOT_RECORDED: refused} if refused else {})
-            return history
+        entries = saved["history"]
         history.refused, history.settled, history.ways = (
             _counts(entries[name], name) for name in ("refused", "settled", "ways")
         )
@@ -219,9 +214,9 @@ class History:
         history.waiting = {name: _streak_from(streak) for name, streak in _sensors(entries["waiting"]).items()}
         if not history.waiting.keys() <= history.trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history.looks = {name: _look_from(look) for name, look in _sensors(entries.get("looks", {})).items()}
-        history.usual = {name: _usual_from(shares) for name, shares in _sensors(entries.get("usual", {})).items()}
-        history.doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries.get("doubts", {})).items()}
+        history.looks = {name: _look_from(look) for name, look in _sensors(entries["looks"]).items()}
+        history.usual = {name: _usual_from(shares) for name, shares in _sensors(entries["usual"]).items()}
+        history.doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries["doubts"]).items()}
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
@@ -321,9 +316,6 @@ def _imported_from(saved: Any) -> Imported | None:
 
 
 def _path_from(saved: Any) -> CameraPath:
-    """Return the sensors' path; empty for maps from before it was saved."""
-    if saved is None:
-        return CameraPath()
     return CameraPath.loaded({**saved, "stops": _sensors(saved["stops"])})
 
 

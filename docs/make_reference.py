@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/reference/commands.md and settings.md from argparse and the settings: python docs/make_reference.py.
+"""Write pages of docs/reference from argparse, the settings and the table of checks: python docs/make_reference.py.
 
 A test compares the files with what is written here.
 """
@@ -16,7 +16,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ByteSize
 from pydantic.fields import FieldInfo
 
-from stereovox import Config, cli, load_config, registry
+from stereovox import Config, cli, entrance, load_config, registry
 from stereovox.config import profile_names
 from stereovox.sensors import SENSORS
 
@@ -63,9 +63,29 @@ made with are saved in it. Lengths are metres unless the description says otherw
 [How to choose](../choosing.md).
 """
 
+REFUSALS = """# Refusals
+
+{source}
+
+What `Mapper.add` (the first three kinds of input) and `GridMapper.add` (the others) check before a measurement may
+change a map. A cell is the function that refuses, or why there is nothing to check. All recordings, running cameras,
+ROS 2 and fleets enter through these two, so the checks are the same. A refused input changes nothing but the count of
+refusals.
+[What a map promises](../safety.md#which-frames-may-change-the-map) explains the checks of time, pose and content. In
+Python: `stereovox.entrance.CHECKS`.
+
+{table}
+
+Reasons that sources, trackers and localisation give:
+
+| refused as | when |
+|---|---|
+{others}
+"""
+
 
 def main() -> None:
-    """Write both pages."""
+    """Write the pages."""
     FOLDER.mkdir(exist_ok=True)
     for name, text in pages().items():
         (FOLDER / name).write_text(text)
@@ -73,7 +93,13 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """Return the text of each page by its file's name."""
-    return {"commands.md": _commands(), "settings.md": _settings()}
+    return {"commands.md": _commands(), "settings.md": _settings(), "refusals.md": _refusals()}
+
+
+def _refusals() -> str:
+    others = [f"| `{reason}` | {when} |" for reason, when in entrance.ELSEWHERE.items()]
+    source = SOURCE.format("stereovox.entrance")
+    return REFUSALS.format(source=source, table="\n".join(entrance.table()), others="\n".join(others))
 
 
 def _commands() -> str:

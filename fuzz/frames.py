@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random frames, scans and stereo pairs into mappers of all kinds: `python fuzz/frames.py --seconds 3600 --seed 1`.
+"""Random images, pairs, clouds and scans into mappers of all kinds: `python fuzz/frames.py --seconds 3600 --seed 1`.
 
 What must hold: no exception, not even a warning; a refused frame leaves every bit of the map as it was and says why in
 one line; no call takes longer than a second; no cell leaves its range. What does not is printed, and the exit status is
@@ -31,9 +31,9 @@ from mapper_kinds import KINDS, Kind
 from random_cameras import RARE
 from random_frames import DTYPES, Maker
 from stereovox.errors import ConfigError
-from stereovox.frame import Frame, Scan, StereoFrame
+from stereovox.frame import Cloud, Frame, Scan, StereoFrame
 
-SEEN = Frame, Scan, StereoFrame
+SEEN = Frame, Scan, StereoFrame, Cloud
 SLOW_S = 1.0
 SLOWEST = 5
 """Calls that are kept as the slowest."""
@@ -197,10 +197,9 @@ def digest(voxel_map: Any) -> tuple[Any, ...]:
 
 def described(thing: Any) -> str:
     """Return in a few words what was offered."""
-    with suppress(AttributeError):
-        image = (
-            thing.depth if isinstance(thing, Frame) else thing.left if isinstance(thing, StereoFrame) else thing.ranges
-        )
+    with suppress(AttributeError, KeyError):
+        names = {Frame: "depth", StereoFrame: "left", Cloud: "points", Scan: "ranges"}
+        image = getattr(thing, names[type(thing)])
         by = thing.camera if isinstance(thing, Frame) else thing.pair.camera if isinstance(thing, StereoFrame) else ""
         return f"{type(thing).__name__} {image.dtype}{list(image.shape)} {by}"[:400]
     return type(thing).__name__

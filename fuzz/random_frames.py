@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random frames, scans and stereo pairs of a few pixels: sound ones, odd ones, and ones that are nonsense."""
+"""Random images, pairs, clouds and scans of a few pixels or points: sound ones, odd ones, and nonsense."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ ODD_DTYPES = (
 )  # fmt: skip
 DTYPES, NO_DTYPES = ("f4", "f4", "f8", "u2", "u2"), ("f2", ">f4", ">u2", "i4", "u1")
 """Kinds of number that depth comes in, and that it must not; whole ones are millimetres."""
+CLOUD_DTYPES = ("f4", "f4", "f8", "f2", "i4", ">f4")
+LIDARS = (sv.Lidar(), sv.Lidar(), sv.Lidar(0.02, 0.0, 3.0), sv.Lidar(1e-9, 0.1), sv.Lidar(5.0, 0.0, 1e12))
 ROOM_M = np.array([4.0, 3.0, 2.5])
 """From the origin to the walls of the room that plausible images show."""
 CAMERAS = 60
@@ -51,8 +53,9 @@ class Maker:
         self._pairs = [self._shapes.pair(model) for model in (None, None, "spherical", "cylindrical")]
 
     def frame(self) -> AnyFrame:
-        """Return a depth image or a stereo pair."""
-        made = self._stereo() if self._chance(0.1) else self._depth()
+        """Return a depth image, a stereo pair or a cloud."""
+        chance = self._rng.random()
+        made = self._stereo() if chance < 0.1 else self._cloud() if chance < 0.3 else self._depth()
         return self._spoilt(made) if self._chance(0.25) else self._same(made)
 
     def scan(self) -> Scan:
@@ -99,6 +102,25 @@ class Maker:
         if self._chance(0.5) and left.shape == right.shape:
             right = np.roll(left, -int(self._rng.integers(1, 9)), axis=1)
         return StereoFrame(left, right, pair, self._pose(), **self._shared())
+
+    def _cloud(self) -> sv.Cloud:
+        """Return a cloud of the room, of random points, or of points that all are strange."""
+        rng, count = self._rng, int(self._one_of((0, 1, 7, 40, 250, 1500)))
+        T = from_quaternion(rng.uniform(-1, 1, 3), rng.normal(size=4)) if self._chance(0.6) else self._pose()
+        points = rng.normal(size=(count, 3)) * self._one_of((1.0, 1.0, 1000.0, 1e-4))
+        if self._chance(0.6):
+            points = room_points(T, points) + rng.normal(size=(count, 3)) * self._one_of((0.0, 0.02, 0.3))
+        strange = rng.random(count) < self._one_of((0.0, 0.0, 0.1, 0.997, 1.0))
+        points[strange] = rng.choice(STRANGE, (int(strange.sum()), 3))
+        with np.errstate(all="ignore"):
+            points = points.astype(self._one_of(CLOUD_DTYPES))
+        lidar = self._one_of(LIDARS)
+        more = {}
+        if self._chance(0.2):
+            more["origins"] = rng.normal(size=(count, 3)) * self._one_of((0.1, 0.1, 1e4, np.nan))
+        if self._chance(0.2):
+            more["clear"] = rng.normal(size=(int(self._one_of((0, 5, 300))), 3)) * self._one_of((3, 3, 5000, np.inf))
+        return sv.Cloud(points, T, lidar=lidar, **more, **self._shared())
 
     def _scan(self) -> Scan:
         rng = self._rng
@@ -203,6 +225,14 @@ class Maker:
         array = array.copy()
         array.flags.writeable = False
         return array
+
+
+def room_points(T_world_sensor: Any, rays: np.ndarray) -> np.ndarray:
+    """Return where rays (N, 3) of a sensor in the room about the origin meet its walls, in the sensor's frame."""
+    with np.errstate(all="ignore"):
+        directions = rays @ np.asarray(T_world_sensor)[:3, :3].T
+        walls = (np.sign(directions) * ROOM_M - np.asarray(T_world_sensor)[:3, 3]) / directions
+        return rays * np.min(np.where(directions == 0, np.inf, walls), axis=1)[:, None]
 
 
 def room_depth(camera: VirtualCamera, T_world_camera: np.ndarray) -> np.ndarray:

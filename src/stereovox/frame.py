@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from math import inf, nan
+from math import inf, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,10 @@ from stereovox.se3 import Transform, inverse
 
 NOT_GIVEN: float = nan
 """Depth scale of a frame that was made without one."""
+
+
+class _Assumed(float):
+    """The scale 1 of float images whose scale was not given. It is no scale of whole numbers that replace them."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,7 @@ class Frame:
         camera: The camera that took it; its size must be the image's.
         T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
         stamp_ns: Time of the image in int64 nanoseconds.
-        depth_scale: Metres per unit of `depth` (0.001 for millimetres). Not given: 1 for floats; integer images
+        depth_scale: Metres per unit of `depth` (0.001 for millimetres). Not given (NaN): 1 for floats; integer images
             without it are refused, since their unit is unknown.
         reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None. VALID:
             as the depth says.
@@ -171,8 +175,10 @@ class Frame:
     pose_sigma: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if self.depth_scale is NOT_GIVEN and getattr(getattr(self.depth, "dtype", None), "kind", "") == "f":
-            object.__setattr__(self, "depth_scale", 1.0)
+        given = self.depth_scale
+        if isinstance(given, _Assumed) or (isinstance(given, float | np.floating) and isnan(given)):
+            kind = getattr(getattr(self.depth, "dtype", None), "kind", "")
+            object.__setattr__(self, "depth_scale", _Assumed(1) if kind == "f" else NOT_GIVEN)
 
 
 @dataclass(frozen=True, eq=False)

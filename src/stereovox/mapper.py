@@ -15,6 +15,7 @@ from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
+from stereovox.depth.quality import checked_scan
 from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Cloud, Frame, Scan
@@ -302,7 +303,7 @@ class GridMapper:
         """
         with self._intake.offer(frame) as offer:  # a FrameRefused ends here and becomes the report
             started = perf_counter()
-            scan = validate_upright_scan(frame if isinstance(frame, Scan) else self._to_scan(frame), self.config)
+            scan = checked_scan(frame, self.config) if isinstance(frame, Scan) else self._to_scan(frame)
             passed = offer.check(scan)
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
@@ -364,7 +365,7 @@ class GridMapper:
     def _to_scan(self, frame: AnyFrame) -> Scan:
         from stereovox.depth.scan import scan_of
 
-        return scan_of(self._depth.image(self._depth.matched(frame)), self.config)
+        return validate_upright_scan(scan_of(self._depth.image(self._depth.matched(frame)), self.config), self.config)
 
 
 def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap:

@@ -90,7 +90,7 @@ def test_rays_without_echo_are_free_only_where_that_is_said():
     ("change", "reason"),
     [
         ({"points": np.zeros((4, 2))}, "bad_shape"),
-        ({"points": np.zeros((4, 3), int)}, "bad_shape"),
+        ({"points": np.zeros((4, 3), int)}, "bad_dtype"),
         ({"points": [[1.0, 2.0, 3.0]]}, "bad_form"),
         ({"points": np.full((4, 3), np.nan)}, "no_valid_point"),
         ({"points": np.empty((0, 3))}, "no_valid_point"),

@@ -23,7 +23,7 @@ def test_nothing_crashes_and_no_refused_frame_changes_a_map():
     tally = fuzz.run(1500, seed=7, timed_from=1500)
     assert tally.bad == []
     assert tally.changed_by_refused == 0
-    assert set(tally.frames) == {"Frame", "StereoFrame", "Scan", "nonsense"}
+    assert set(tally.frames) == {"Frame", "StereoFrame", "Scan", "Cloud", "nonsense"}
     assert sum(tally.taken.values()) > 400
     assert len(tally.taken) == len(KINDS)
     assert len(tally.refused) > 15

@@ -60,7 +60,7 @@ NOWHERE = np.full((4, 4), np.nan)
         ("unreadable", {"fault": "unreadable"}),
         ("bad_shape", {"ranges": np.zeros((2, 3), np.float32)}),
         ("bad_shape", {"ranges": np.zeros(0, np.float32)}),
-        ("bad_shape", {"ranges": np.ones(5, int)}),
+        ("bad_dtype", {"ranges": np.ones(5, int)}),
         ("bad_scan", {"angle_step": np.nan}),
         ("bad_scan", {"range_max": np.inf}),
         ("bad_scan", {"range_max": 0.0}),

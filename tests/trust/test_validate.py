@@ -164,7 +164,7 @@ def test_stereo_pairs(voxels, changes, reason):
     [
         ({"ranges": None}, "bad_form"),
         ({"ranges": [1.0, 2.0]}, "bad_form"),
-        ({"ranges": np.ones(9, complex)}, "bad_shape"),
+        ({"ranges": np.ones(9, complex)}, "bad_dtype"),
         ({"ranges": np.ma.masked_array(np.ones(9), np.eye(9)[0])}, "bad_form"),
         ({"angle_min": None}, "bad_form"),
         ({"angle_step": "0.1"}, "bad_form"),

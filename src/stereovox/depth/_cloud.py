@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that picks the rays of a cloud that say something."""
+"""Kernels for clouds: pick the rays that say something, find the rays next to some of them."""
 
 import numpy as np
 
@@ -37,3 +37,22 @@ def usable(points, origins, range_min, range_max, reach, ends, starts, hits):
         hits[used] = not far
         used += 1
     return used, finite
+
+
+@kernel
+def nearest(directions, asked, found):
+    """Fill `found` (Q,) with the column of the unit vector nearest to each asked one, which itself does not count.
+
+    directions: (3, N) float32; asked: (Q,) int64 columns of it.
+    """
+    x, y, z = directions[0], directions[1], directions[2]
+    for q in range(asked.size):
+        i = asked[q]
+        a, b, c = x[i], y[i], z[i]
+        least, at = np.float32(np.inf), np.int64(-1)
+        for j in range(x.size):
+            dx, dy, dz = x[j] - a, y[j] - b, z[j] - c
+            square = dx * dx + dy * dy + dz * dz
+            if square < least and j != i:
+                least, at = square, j
+        found[q] = at

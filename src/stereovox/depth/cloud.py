@@ -12,12 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
 from stereovox.depth._cloud import usable
+from stereovox.depth.quality import check_cloud, check_unit_of_rays
 from stereovox.errors import FrameRefused
 from stereovox.frame import MAX_POINTS, CheckedCloud, Cloud, name_of
 from stereovox.se3 import Transform, inverse
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.trust.validate import rigid_pose, validate_fields
 
+SOME = 4096
+"""Points of a cloud by which its unit is checked."""
 STEPS, STEP_S = 64, 0.002
 """Poses of a moving sensor during one cloud, and most seconds between two: it moves a few centimetres meanwhile."""
 LONGEST_S, FARTHEST_S = 10.0, 1e6
@@ -30,8 +33,8 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     Points without value, and those nearer than the lidar's or the settings' minimum range, are left out: their rays
     clear nothing. Rays beyond the lidar's own maximum range end there, with no surface, and at least four sigma before
     their point.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_shape`,
-    `too_many_points`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_point`.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
+    `bad_shape`, `too_many_points`, `bad_units`, `no_valid_point`, `too_few_values`, `no_surfaces`, and as `rigid_pose`.
     """
     validate_fields(cloud, Cloud)
     T = rigid_pose(cloud, config.pose_rigidity_tolerance)
@@ -43,6 +46,7 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     clear = clear[np.isfinite(clear).all(axis=1)]
     room = len(points) + len(clear)
     ends, starts, hits = np.empty((room, 3)), np.empty((room, 3)), np.zeros(room, bool)
+    _check_unit(cloud, points, origins, clear, config)
     nearest = max(cloud.lidar.range_min, config.min_range)
     none = np.empty((0, 3)) if origins is None else origins
     farthest, reach = float(cloud.lidar.range_max), REACH_SIGMA * float(cloud.lidar.sigma)
@@ -53,7 +57,24 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     rays = used + len(clear)
     ends[used:rays], starts[used:rays], hits[used:rays] = clear, 0.0, False
     begin = None if origins is None else starts[:rays]
-    return CheckedCloud(ends[:rays], begin, hits[:rays], cloud.lidar, T, int(cloud.stamp_ns))
+    checked = CheckedCloud(ends[:rays], begin, hits[:rays], cloud.lidar, T, int(cloud.stamp_ns))
+    check_cloud(checked, cloud, config)
+    return checked
+
+
+def _check_unit(
+    cloud: Cloud,
+    points: NDArray[np.float64],
+    origins: NDArray[np.float64] | None,
+    clear: NDArray[np.float64],
+    config: Config,
+) -> None:
+    """Raise FrameRefused `bad_units` where some of a cloud's points, or of its free rays, are not in metres."""
+    for ends, starts in ((points, origins), (clear, None)):
+        some = slice(None, None, max(1, len(ends) // SOME))
+        arms = ends[some] if starts is None else ends[some] - starts[some]
+        with np.errstate(over="ignore", invalid="ignore"):
+            check_unit_of_rays(cloud, np.sqrt(np.einsum("ij,ij->i", arms, arms)), config)
 
 
 def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transform]) -> Cloud:
@@ -100,9 +121,10 @@ def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
     given = getattr(cloud, field)
     if given is None:
         return np.empty((0, 3))
-    if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind != "f":
-        detail = f"{field} are {given.shape} {given.dtype}; give (N, 3) float32 metres"
-        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
+    if given.dtype.kind != "f":
+        raise FrameRefused("bad_dtype", f"{name_of(cloud)}: {field} are {given.dtype}; give float32 metres")
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {field} are {given.shape}; give (N, 3) metres")
     if len(given) > MAX_POINTS:
         raise FrameRefused("too_many_points", f"{name_of(cloud)}: {len(given)} {field}; at most {MAX_POINTS} are taken")
     return np.ascontiguousarray(given, float)

@@ -38,9 +38,13 @@ class DepthPipeline:
 
     def image(self, frame: Frame) -> DepthImage:
         """Return the frame's depth image. Raises FrameRefused as `prepare` and `check_depth`."""
+        return through_sphere(self.checked(frame), self._config)
+
+    def checked(self, frame: Frame) -> DepthImage:
+        """Return as `image` what was measured, before it is gathered on a spherical grid."""
         image = prepare(frame, self._config)
         check_depth(image, frame, self._config)
-        return through_sphere(image, self._config)
+        return image
 
     @cached_property
     def _stereo(self) -> StereoDepth:

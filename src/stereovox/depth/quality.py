@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plausibility of images: enough depths, on surfaces, in metres; neither black nor saturated.
+"""Plausibility of images, clouds and scans: enough values, on surfaces, in metres; neither black nor saturated.
 
 Chien 2020, 5.1, asks for such a filter of overexposed images and miscalculated depth. Whether an image agrees with the
 map and the frames before it is checked by the gate.
@@ -7,16 +7,19 @@ map and the frames before it is checked by the gate.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.depth import _images
+from stereovox.depth import _cloud, _images
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage, Frame, Reason, StereoFrame, name_of
+from stereovox.frame import CheckedCloud, Cloud, DepthImage, Frame, Reason, Scan, StereoFrame, name_of
 from stereovox.sensors.noise import RangeNoise
+from stereovox.trust.validate import validate_upright_scan
 
 ROWS = 16
 """Rows of an image that are sampled."""
@@ -33,6 +36,20 @@ NEAR_RANGE, NEAR_M = 0.1, 0.01
 """Median depth, as a share of the minimum range and in metres, below which the unit must be wrong."""
 SPARSE = 0.05
 """The unit is checked where a smaller share of the pixels has a depth within the range."""
+FAR_LIDAR_M = 300.0
+"""Median range, and at least twice the maximum range of the map, beyond which those of a lidar are not in metres. Half
+of what a lidar on a vehicle measures is nearer; a room in millimetres is farther. One in feet or in centimetres may be
+nearer, and cannot be recognised."""
+SAMPLE, ASKED, ALL = 4096, 256, 1 << 18
+"""Rays of a cloud that are looked at, those of them whose neighbours are sought, and rays among which they are sought
+once more before a cloud is refused: leaves of a thicket are alike only from one ray to the very next."""
+FEW_RAYS, FEW_BEAMS = 200, 50
+"""So few rays of a cloud, or beams of a scan, prove neither surfaces nor their absence."""
+ALIKE, ALIKE_SIGMA = 0.03, 3 * sqrt(2)
+"""Ranges of neighbours differ on a surface by no more than their distance across, this share of the range, and so many
+standard deviations of a range."""
+TINY_M, BEAM_SIGMA_M = 1e-6, 0.03
+"""Length of a ray whose length is 0, and the standard deviation assumed of a 2-D lidar's ranges."""
 
 
 def check_depth(image: DepthImage, frame: Frame, config: Config) -> None:
@@ -69,19 +86,131 @@ def _check_share(image: DepthImage, frame: Frame, least: float) -> None:
 
 def check_unit(frame: Frame, depth_m: NDArray[np.floating], config: Config) -> None:
     """Raise FrameRefused `bad_units` where the depths (N,) of a frame, in metres, cannot be metres."""
-    depths = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
-    if not depths.size:
-        return
-    depths.sort()
-    median = float(depths[(depths.size - 1) // 2] + depths[depths.size // 2]) / 2  # np.median takes ten times as long
-    if median > max(FAR_RANGES * config.max_range, FAR_M):
-        cure = "is it in millimetres? give depth_scale=0.001"
-    elif median < min(NEAR_RANGE * config.min_range, NEAR_M):
-        cure = "is it in metres already? give depth_scale=1"
-    else:
-        return
-    detail = f"half of its depths are {'beyond' if median > 1 else 'below'} {median:.4g} m with depth_scale"
-    raise FrameRefused("bad_units", f"{name_of(frame)}: {detail} {frame.depth_scale:g}; {cure}")
+    found = _wrong_unit(depth_m, max(FAR_RANGES * config.max_range, FAR_M), config)
+    if found:
+        cure = "millimetres? give depth_scale=0.001" if found[1] == "beyond" else "metres already? give depth_scale=1"
+        detail = f"half of its depths are {found[1]} {found[0]:.4g} m with depth_scale {frame.depth_scale:g}"
+        raise FrameRefused("bad_units", f"{name_of(frame)}: {detail}; is it in {cure}")
+
+
+def check_unit_of_rays(seen: Cloud | Scan, lengths_m: NDArray[np.floating], config: Config) -> None:
+    """Raise FrameRefused `bad_units` where the lengths (N,) of a lidar's rays, in metres, cannot be metres."""
+    found = _wrong_unit(lengths_m, max(2 * config.max_range, FAR_LIDAR_M), config)
+    if found:
+        cure = "millimetres? multiply by 0.001" if found[1] == "beyond" else "kilometres? multiply by 1000"
+        detail = f"half of its ranges are {found[1]} {found[0]:.4g} m; give metres"
+        raise FrameRefused("bad_units", f"{name_of(seen)}: {detail}: are they in {cure}")
+
+
+def _wrong_unit(lengths_m: NDArray[np.floating], farthest_m: float, config: Config) -> tuple[float, str] | None:
+    """Return the median of lengths (N,) where it cannot be in metres, and whether it is `beyond` or `below` that."""
+    known = lengths_m[np.isfinite(lengths_m) & (lengths_m > 0)]
+    if not known.size:
+        return None
+    known.sort()
+    median = float(known[(known.size - 1) // 2] + known[known.size // 2]) / 2  # np.median takes ten times as long
+    if median > farthest_m:
+        return median, "beyond"
+    return (median, "below") if median < min(NEAR_RANGE * config.min_range, NEAR_M) else None
+
+
+def check_cloud(checked: CheckedCloud, cloud: Cloud, config: Config) -> None:
+    """Raise FrameRefused where a checked cloud shows too little, or no surfaces: `too_few_values`, `no_surfaces`."""
+    given = len(cloud.points) + (0 if cloud.clear is None else len(cloud.clear))
+    _check_number(cloud, len(checked.ends), given, "points", config)
+    if config.trust.min_surface_share:
+        _check_alike(cloud, partial(_alike_of, checked), config)
+
+
+def checked_scan(scan: Scan, config: Config) -> Scan:
+    """Return a lidar's scan with an exactly rigid pose.
+
+    Raises FrameRefused as `validate_upright_scan` and `check_scan`.
+    """
+    scan = validate_upright_scan(scan, config)
+    check_scan(scan, config)
+    return scan
+
+
+def check_scan(scan: Scan, config: Config) -> None:
+    """Raise FrameRefused where a validated scan of a lidar cannot be true.
+
+    The reason is `bad_units`, `no_valid_range`, `too_few_values`, or `no_surfaces`.
+    """
+    ranges = np.asarray(scan.ranges, float)
+    check_unit_of_rays(scan, ranges, config)
+    hit = (ranges >= scan.range_min) & (ranges > 0) & (ranges <= scan.range_max) & np.isfinite(ranges)
+    says = hit | (ranges == np.inf)
+    clear = scan.clear
+    if clear is not None and clear.shape == ranges.shape and clear.dtype.kind in "fiu":  # else it is refused later
+        says |= clear > 0
+    number = int(np.count_nonzero(says))
+    if not number:
+        raise FrameRefused("no_valid_range", f"{name_of(scan)}: not one beam has a range; is the lidar covered?")
+    _check_number(scan, number, ranges.size, "beams", config)
+    at = np.flatnonzero(hit)
+    if config.trust.min_surface_share and len(at) > FEW_BEAMS:
+        gap = abs(float(scan.angle_step)) * np.diff(at)
+        share = _alike(ranges[at], np.arange(len(gap)), np.arange(1, len(at)), gap, BEAM_SIGMA_M)
+        _check_alike(scan, lambda _: share, config)
+
+
+def _check_number(seen: Cloud | Scan, number: int, of: int, what: str, config: Config) -> None:
+    """Raise FrameRefused `too_few_values` where `number` of so many points or beams are too few to say something."""
+    least = config.trust.min_valid_share
+    if number < least * of:
+        detail = f"{number} of {of} {what} say something (trust.min_valid_share {least:g}); is the view blocked?"
+        raise FrameRefused("too_few_values", f"{name_of(seen)}: {detail}")
+
+
+def _check_alike(seen: Cloud | Scan, alike: Callable[[int], float], config: Config) -> None:
+    """Raise FrameRefused `no_surfaces` where too few ranges are like those next to them.
+
+    alike: returns the share of them, 0 to 1, among so many rays.
+    """
+    least = config.trust.min_surface_share
+    if alike(SAMPLE) < least and (share := alike(ALL)) < least:
+        detail = f"{max(share, 0):.0%} of its ranges are like those next to them (trust.min_surface_share {least:g})"
+        raise FrameRefused("no_surfaces", f"{name_of(seen)}: {detail}; check sensor and driver")
+
+
+def _alike_of(checked: CheckedCloud, most: int) -> float:
+    """Return `_alike` for some points of a cloud and the nearest direction among at most about `most` others."""
+    at = np.flatnonzero(checked.hits)
+    at = at[:: max(1, len(at) // most)]
+    if len(at) < FEW_RAYS:
+        return 1.0
+    arms = checked.ends[at] if checked.origins is None else checked.ends[at] - checked.origins[at]
+    ranges = np.maximum(np.sqrt(np.einsum("ij,ij->i", arms, arms)), TINY_M)
+    directions = np.ascontiguousarray((arms / ranges[:, None]).T, np.float32)
+    asked = np.arange(0, len(at), max(1, len(at) // ASKED))
+    found = np.empty(len(asked), np.int64)
+    _cloud.nearest(directions, asked, found)
+    gap = np.linalg.norm(directions[:, asked] - directions[:, found], axis=0)
+    return _alike(ranges, asked, found, gap, checked.lidar.sigma)
+
+
+def _alike(
+    ranges: NDArray[np.float64],
+    one: NDArray[np.integer],
+    next_to_it: NDArray[np.integer],
+    gap: NDArray[np.floating],
+    sigma: float,
+) -> float:
+    """Return how much ranges (N,) are like those in nearly the same direction: 1 wholly, 0 as any two of them.
+
+    one, next_to_it: (Q,) rows of ranges that are next to each other; gap: (Q,) radians between them; sigma: metres.
+
+    A pair counts fully where it may lie on one surface that is seen under at least 45 degrees. Otherwise it counts by
+    how few of all ranges are as near to the one as its neighbour is: half of them on average where ranges are random,
+    whatever their distribution and however the rays lie; hardly any on walls, on the ground, and in a bush.
+    """
+    logs = np.log(ranges)
+    off = np.abs(logs[one] - logs[next_to_it])
+    ordered = np.sort(logs)
+    below, above = np.searchsorted(ordered, logs[one] - off, "right"), np.searchsorted(ordered, logs[one] + off, "left")
+    on_surface = off <= gap + ALIKE + ALIKE_SIGMA * sigma / ranges[one]
+    return float(2 * np.where(on_surface, 1.0, 1 - (above - below) / len(ordered)).mean() - 1)
 
 
 def check_light(frame: StereoFrame, limit: float) -> None:

@@ -15,10 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import Lidar
 from stereovox.config import load_config
+from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats.cell_size import suggested_cell
 from stereovox.formats.read_points import MAX_BLOCKS
+from stereovox.frame import Cloud
 from stereovox.integrate.crossing import scan_evidence
 from stereovox.maps import VoxelMap
 from stereovox.safe_io import read_bounded, shown
@@ -39,6 +42,8 @@ STEPS_OF_ANY, STEPS_A_POINT, MAX_STEPS = 1 << 19, 10_000, 1 << 31
 """Cells along all rays together: of any graph, more for each of its points, and never more than these."""
 BLOCK_BYTES = 1024
 MAX_PLACE = 1e9
+ANY = Lidar(range_min=0.0)
+"""Nothing is known of the sensor."""
 
 
 class Scan(NamedTuple):
@@ -52,7 +57,8 @@ def read_scan_graph(path: str | Path, voxel_size: float | None = None) -> VoxelM
     """Return the map of a scan graph: in each scan, cells with points are hit, the others on the way to them passed.
 
     voxel_size: metres; None: one suggested. A cell that one scan passes is free and one that it hits occupied; where
-    scans contradict each other their log-odds add up. Raises MapFileError: one line with the file and what is wrong.
+    scans contradict each other their log-odds add up. Raises MapFileError: one line with the file and what is wrong,
+    also for scans that a mapper would refuse as clouds (`checked_cloud`).
     """
     try:
         return _map_of(read_scans(path), Path(path).name, voxel_size)
@@ -96,8 +102,9 @@ def _map_of(scans: list[Scan], name: str, voxel_size: float | None) -> VoxelMap:
     steps = float(sum(lengths))
     if steps / size > min(MAX_STEPS, STEPS_OF_ANY + STEPS_A_POINT * sum(map(len, world))):
         raise StereovoxError(f"its rays cross {steps / size:.2g} cells of {size:g} m; give a larger --voxel-size")
-    for scan, points in zip(scans, world, strict=True):
+    for number, (scan, points) in enumerate(zip(scans, world, strict=True), 1):
         if len(points):
+            checked_cloud(Cloud(scan.points, scan.T_world_sensor, lidar=ANY, name=f"scan {number}"), config)
             made.add(scan_evidence(scan.T_world_sensor[:3, 3], points, size, HIT, MISS))
         if made.memory_bytes > 2 * MAX_BLOCKS * BLOCK_BYTES:
             raise StereovoxError(f"cells of {size:g} m fill more than 1 GB; give a larger --voxel-size")

@@ -13,7 +13,7 @@ from time import monotonic
 from typing import Any, Protocol
 
 from stereovox.config import Config, load_config
-from stereovox.depth import DepthPipeline, prepare
+from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import SphereGrid, SphereLayout, accumulate
 from stereovox.depth.sphere.vehicle import together
 from stereovox.errors import FrameRefused, StereovoxError
@@ -154,7 +154,7 @@ class LiveSphere:
         if report.refused or isinstance(frame, Cloud):
             return
         try:
-            image = prepare(self._pipeline.matched(frame), self._config)
+            image = self._pipeline.checked(self._pipeline.matched(frame))
         except FrameRefused:
             return  # the map took it at another quality
         mount = self._mounts[frame.sensor]

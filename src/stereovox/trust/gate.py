@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import zlib
-from math import inf, radians
+from math import cos, inf, radians
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +36,8 @@ STILL_M, STILL_RAD = 0.01, radians(0.5)
 """Apparent motion of a camera at rest with a jittery tracker."""
 DIGEST_ROWS = 16
 """Rows of an image that its checksum covers."""
+DIGEST_POINTS = 1024
+"""Points of a cloud that its checksum covers: many may have no value."""
 ROUGH, ROUGH_SHARE = 1e-3, 0.2
 """Measured inverse depth bends by at least this share of itself, at this share of the pixels; walls without noise do
 not, and look the same from many places."""
@@ -162,16 +164,17 @@ class Gate:
         return frame.sensor or usual, int(frame.stamp_ns)
 
     def _look(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Look | None:
-        """Return the frame's image checksum. Raises FrameRefused for a repeated image although the camera has moved."""
-        if isinstance(frame, Scan) or not self._trust.frozen:
+        """Return the frame's checksum. Raises FrameRefused for a repeated image although the sensor has moved."""
+        if not self._trust.frozen:
             return None
         look, before = Look(_digest(frame), now.pose), self._history.looks.get(sensor)
         if before is None or before.digest != look.digest:
             return look
         metres, angle = apart(before.pose, now.pose)
-        if (metres > STILL_M or angle > STILL_RAD) and (not isinstance(frame, Frame) or _is_measured(frame.depth)):
-            detail = f"the image is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
-            raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the camera")
+        if (metres > STILL_M or angle > STILL_RAD) and _is_measured(frame):
+            what, cure = ("image", "camera") if isinstance(frame, Frame | StereoFrame) else ("sweep", "lidar")
+            detail = f"the {what} is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
+            raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
 
     def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Passed:
@@ -340,23 +343,32 @@ def _rows(image: np.ndarray) -> np.ndarray:
     return image[DIGEST_ROWS // 2 if len(image) > DIGEST_ROWS else 0 :: max(1, len(image) // DIGEST_ROWS)]
 
 
-def _digest(frame: AnyFrame) -> int:
-    """Return a checksum of DIGEST_ROWS rows of the frame's images."""
+def _digest(frame: AnyFrame | Scan) -> int:
+    """Return a checksum of DIGEST_ROWS rows of the frame's images, of DIGEST_POINTS points, or of all ranges."""
     if isinstance(frame, StereoFrame):
-        images = frame.left, frame.right
+        parts = _rows(frame.left), _rows(frame.right)
+    elif isinstance(frame, Cloud):
+        parts = (frame.points[:: max(1, len(frame.points) // DIGEST_POINTS)],)
     else:
-        images = (frame.points if isinstance(frame, Cloud) else frame.depth,)
+        parts = (frame.ranges if isinstance(frame, Scan) else _rows(frame.depth),)
     number = 0
-    for image in images:
-        number = zlib.crc32(np.ascontiguousarray(_rows(image)).tobytes(), number)
+    for part in parts:
+        number = zlib.crc32(np.ascontiguousarray(part).tobytes(), number)
     return number
 
 
-def _is_measured(depth: np.ndarray) -> bool:
-    """Return whether depths (height, width) have noise: whether inverse depth bends between neighbours."""
-    rows = _rows(depth).astype(float)
+def _is_measured(frame: AnyFrame | Scan) -> bool:
+    """Return whether depths or ranges have noise: whether their inverse bends between neighbours.
+
+    That of a plane does not in an image, and between beams only by their angle. Other frames are taken for measured.
+    """
+    if isinstance(frame, StereoFrame | Cloud):
+        return True
+    is_scan = isinstance(frame, Scan)
+    rows = (frame.ranges[None] if is_scan else _rows(frame.depth)).astype(float)
+    straight = 2 * cos(frame.angle_step) if is_scan else 2.0
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(np.isfinite(rows) & (rows > 0), 1 / rows, np.nan)
-        bend = np.abs(np.diff(inverse, 2, axis=1)) / inverse[:, 1:-1]
+        bend = np.abs(inverse[:, 2:] + inverse[:, :-2] - straight * inverse[:, 1:-1]) / inverse[:, 1:-1]
     bend = bend[np.isfinite(bend)]
     return bool(bend.size and (bend > ROUGH).mean() > ROUGH_SHARE)

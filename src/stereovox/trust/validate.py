@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -19,7 +20,8 @@ from stereovox.frame import Cloud, Frame, Scan, StereoFrame, name_of
 EXACT = 1e-14
 """Rigidity error of a rotation in float64 that cannot be improved."""
 MAX_POSITION = 1e6
-"""Metres beyond which a position is an error."""
+"""Metres from the world's origin along an axis from which on a position is an error."""
+TOO_FAR = f"positions must lie within {MAX_POSITION:g} m: subtract an offset, or is the unit wrong?"
 MAX_INT = 2**63
 """Integers from here on do not fit into 64 bits."""
 
@@ -97,14 +99,16 @@ def validate_fields(seen: Any, *kinds: type) -> None:
 def validate_scan(scan: Scan, rigidity: float) -> Scan:
     """Return the scan with exactly rigid pose and mount; `rigidity` is the largest error that is rounded away.
 
-    Raises FrameRefused: `bad_form`, the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
-    `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
+    Raises FrameRefused: `bad_form`, the source's `fault`, `bad_dtype`, `bad_shape`, `bad_scan`, `mount_not_rigid`,
+    `mount_too_far`, and as `rigid_pose`.
     """
     validate_fields(scan, Scan)
     name = name_of(scan)
     ranges = np.asarray(scan.ranges)
-    if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
-        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
+    if not np.issubdtype(ranges.dtype, np.floating):
+        raise FrameRefused("bad_dtype", f"{name}: ranges are {ranges.dtype}; give float32 metres")
+    if ranges.ndim != 1 or not ranges.size:
+        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape}; give (N,) metres")
     angles = float(scan.angle_min), float(scan.angle_step)
     limits = float(scan.range_min), float(scan.range_max)
     if (
@@ -115,8 +119,6 @@ def validate_scan(scan: Scan, rigidity: float) -> Scan:
         found = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
         raise FrameRefused("bad_scan", f"{name}: {found}; steps must not be 0, and ranges must rise")
     T, mount = rigid_pose(scan, rigidity), _rigid_mount(scan, rigidity)
-    if np.isnan(ranges).all() and scan.clear is None:
-        raise FrameRefused("no_valid_range", f"{name}: not one beam has a range; is the lidar covered?")
     return replace(scan, T_world_sensor=T, T_base_sensor=mount)
 
 
@@ -138,19 +140,26 @@ def validate_upright_scan(scan: Scan, config: Config) -> Scan:
 def rigid_pose(frame: Frame | Cloud | Scan, tolerance: float) -> se3.Transform:
     """Return the rigid motion nearest to the pose; `tolerance` is the largest error that is rounded away.
 
-    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
+    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_too_far`, `pose_not_rigid`.
     """
     if frame.T_world_sensor is None:
         raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
     T = matrix_of(frame.T_world_sensor)
-    if T.shape == (4, 4) and not all(-MAX_POSITION < x < MAX_POSITION for x in T.ravel().tolist()):
-        raise FrameRefused(
-            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
-        )
+    if T.shape == (4, 4):
+        _check_place(T, name_of(frame))
     error = se3.rigidity_error(T)
     if error > tolerance:
         raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is not a rigid 4x4 motion ({_off(T, error)})")
     return se3.orthonormalise(T) if error > EXACT else T
+
+
+def _check_place(T: NDArray[np.float64], name: str) -> None:
+    """Raise FrameRefused where a pose (4, 4) holds numbers that are not finite, or stands too far from the origin."""
+    if not all(map(isfinite, T.ravel().tolist())):
+        raise FrameRefused("pose_not_finite", f"{name}: the pose holds NaN or infinity; leave the frame out")
+    farthest = max(map(abs, T[:3, 3].tolist()))
+    if farthest >= MAX_POSITION:
+        raise FrameRefused("pose_too_far", f"{name}: the pose is {farthest:.7g} m from the world's origin; {TOO_FAR}")
 
 
 def matrix_of(given: object) -> NDArray[np.float64]:
@@ -198,11 +207,13 @@ def _label(seen: object) -> str:
 
 
 def _rigid_mount(scan: Scan, rigidity: float) -> se3.Transform:
-    T = matrix_of(scan.T_base_sensor)
+    T, where = matrix_of(scan.T_base_sensor), "T_base_sensor, the lidar's place on the robot,"
     error = se3.rigidity_error(T)
-    if error > rigidity or (np.abs(T) >= MAX_POSITION).any():
-        detail = "T_base_sensor, where the lidar sits on the robot, is not a rigid 4x4 motion"
-        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {detail} ({_off(T, error)})")
+    if error > rigidity:
+        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {where} is not a rigid 4x4 motion ({_off(T, error)})")
+    farthest = np.abs(T[:3, 3]).max()
+    if farthest >= MAX_POSITION:
+        raise FrameRefused("mount_too_far", f"{name_of(scan)}: {where} is {farthest:.7g} m from the robot; give metres")
     return se3.orthonormalise(T) if error > EXACT else T
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from stereovox.cameras.rigs import StereoPair
 from stereovox.config import Config
-from stereovox.depth import DepthPipeline, prepare
+from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
@@ -81,7 +81,7 @@ def _grid_of(
 ) -> tuple[SphereGrid, Transform]:
     """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
     mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
-    image = prepare(path.matched(frame), config)
+    image = path.checked(path.matched(frame))
     T_world_body = orthonormalise(np.asarray(frame.T_world_sensor, float)) @ inverse(mounted)
     T_body_eye = inverse(T_world_body) @ image.T_world_sensor  # the right eye's, where that is the one with depth
     return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body

@@ -161,9 +161,11 @@ def grey(image: NDArray[np.uint8], size: tuple[int, int], name: str) -> NDArray[
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _eye_pose(T_world_left: object, baseline: float, aligned: str) -> Transform:
+def _eye_pose(T_world_left: Transform, baseline: float, aligned: str) -> Transform:
     """Return T_world_eye (4, 4): the right eye stands the baseline along x from the left."""
     T = matrix_of(T_world_left)
-    if aligned == "right" and T.shape == (4, 4):  # `prepare` refuses bad poses
+    if T.shape != (4, 4):
+        return T_world_left  # `prepare` refuses it, and says whether there is none
+    if aligned == "right":
         T[:3, 3] += T[:3, 0] * baseline
     return T

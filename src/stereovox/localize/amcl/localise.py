@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import se2
 from stereovox.config import Config
+from stereovox.depth.quality import check_scan
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError
 from stereovox.frame import Scan, name_of
 from stereovox.localize.amcl.models import MODELS, moved, turn_go_turn
@@ -75,7 +76,7 @@ class Localiser:
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
-        self.config, self._rigidity = config.amcl, config.pose_rigidity_tolerance
+        self.config, self._checks = config.amcl, config
         self.refused: Counter[str] = Counter()
         self._clock = Clock()
         self._rng = np.random.default_rng(seed)
@@ -92,11 +93,12 @@ class Localiser:
         """Estimate where the robot is after one more scan.
 
         Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`validate_scan`,
-        `beams_of`) or is not later than the one before (`Clock`).
+        `check_scan`, `beams_of`) or is not later than the one before (`Clock`).
         """
         start = perf_counter()
         try:
-            scan = validate_scan(scan, self._rigidity)
+            scan = validate_scan(scan, self._checks.pose_rigidity_tolerance)
+            check_scan(scan, self._checks)
             beams = beams_of(scan, self.config.max_range)
             wrong = self._clock.accept(scan)
         except FrameRefused as refusal:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stereovox import se2
 from stereovox.config import Config, load_config
+from stereovox.depth.quality import checked_scan
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Scan
 from stereovox.integrate.beams import make_beams
@@ -28,7 +29,6 @@ from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.pose_graph import Edge, PoseGraph
-from stereovox.trust.validate import validate_upright_scan
 
 MIN_LATE_SCANS = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
@@ -89,7 +89,7 @@ class Slam:
     def add(self, scan: Scan) -> se2.Pose:
         """Process the next scan; return (3,) pose_map_base as known so far. Later loops may move it."""
         try:
-            scan = validate_upright_scan(scan, self._config)
+            scan = checked_scan(scan, self._config)
         except FrameRefused as refused:
             self._refuse(refused.reason)
             self._first = self._first or f", first: {refused}"

@@ -23,7 +23,7 @@ LAYERS = (
     {"depth", "maps"},
     {"intake", "integrate", "products", "sources"},
     {"comparison", "deadline", "formats", "localize", "rebuild", "simulate", "track"},
-    {"corrected_poses", "loops", "mapper", "opening"},
+    {"corrected_poses", "entrance", "loops", "mapper", "opening"},
     {"calibrate", "closing", "evaluate", "joining", "pose_choice", "remapping", "survey", "warm_up"},
     {"run", "view"},
     {"contents", "fleet", "floor_run", "mavlink", "ros", "report", "track_run", "viewer"},

@@ -113,8 +113,8 @@ def test_a_check_that_is_taken_away_is_missed(check, number, kind, monkeypatch):
 
 SOURCES = Path(sv.__file__).parent
 MAKERS = {
-    "evidence", "scan_evidence", "prepare", "checked_cloud", "checked_scan", "validate_scan", "validate_upright_scan",
-    "checked", "Mapper", "GridMapper",
+    "evidence", "scan_evidence", "crossed_cells", "prepare", "checked", "checked_cloud", "checked_scan",
+    "validate_scan", "validate_upright_scan", "check_unit_of_rays", "Mapper", "GridMapper",
 }  # fmt: skip
 """What is called by whoever turns measurements into evidence, or into a map."""
 INSIDE = ("depth/", "integrate/", "trust/")
@@ -141,7 +141,7 @@ DOORS = {
     "viewer/frame.py": "draws a frame; makes no map",
     "depth/sphere/vehicle.py": "the sphere round a vehicle: DepthPipeline.checked",
     "live/outputs.py": "the sphere of a live run: DepthPipeline.checked, of images that a mapper took",
-    "evaluate/lidar_truth.py": "truth of a recording's lidar: checked_cloud",
+    "evaluate/lidar_truth.py": "truth of a recording's lidar: its unit; it makes no map to move by",
     "calibrate/pair.py": "registers images with each other; makes no map",
     "lab": "benchmarks and papers, of scenes and recordings that they name",
 }

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
-from stereovox.depth.cloud import checked_cloud
+from stereovox.depth.quality import check_unit_of_rays
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.evaluate.cells import indices, keys
 from stereovox.frame import Cloud, Viewpoint
@@ -35,8 +34,6 @@ AT_ONCE = 2048
 OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
 FREE = ("view", "rays")
-ANY = Lidar(range_min=0.0)
-"""Truth counts all points, however near."""
 IN_VIEW, CROSSED, HIT = 1, 2, 4
 """Marks of a cell: in view and range of a frame; crossed by a lidar ray; hit by a point."""
 
@@ -234,8 +231,9 @@ class _Truth:
         try:
             scan, viewpoint, moving = self.source.scan(i), self.source.viewpoint(i), self.source.moving(i)
             boxes = self.source.boxes(i)
-            if scan is not None:  # as a mapper would
-                checked_cloud(Cloud(scan.points, scan.T_world_lidar, lidar=ANY, name=f"scan {i}"), self.config)
+            if scan is not None:
+                cloud = Cloud(scan.points, scan.T_world_lidar, name=f"scan {i}")
+                check_unit_of_rays(cloud, np.linalg.norm(scan.points, axis=1), self.config)
         except FrameRefused as refused:
             self.counts.refused[refused.reason] += 1
             self.counts.first_refusal = self.counts.first_refusal or str(refused)

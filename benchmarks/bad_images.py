@@ -3,20 +3,26 @@
 
     python benchmarks/bad_images.py [SOURCE] [--voxel-size 0.05] [--max-range 5] [--frames A:B:S] [--every 5] [--seed 0]
                                     [--set key=value ...] [--json]
+    python benchmarks/bad_images.py --last 1 4 20 [--seeds 0:3] [--clouds] [--set key=value ...] [--json]
 
 All frames of SOURCE are mapped one by one. Before every N-th of them each kind of bad frame is offered in its place, to
 the map as it is then, and taken back. One that is not refused is harmless where it changes the state of less than 0.1 %
 of the sure cells it says something of, and frees no occupied one; what the true frame would do as well does not count.
+
+With --last, frames are bad for so many seconds, or the world is another one from a moment on: how much of it does the
+map believe, and when? Each seed is a hall at random (`stereovox.lab.checks.lasting`).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 
 import stereovox as sv
 from stereovox.cli.options import add_settings, overrides
 from stereovox.lab.checks.bad_images import trial
+from stereovox.lab.checks.lasting import CHANGES, FAULTS, Trial
 
 
 def main() -> None:
@@ -29,7 +35,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     add_settings(parser, "trust.max_disagreement=1")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument(
+        "--last", type=float, nargs="+", metavar="S", help="faults and changes that last so many seconds"
+    )
+    parser.add_argument("--seeds", default="0:1", help="halls for --last, a Python slice")
+    parser.add_argument("--clouds", action="store_true", help="a lidar in place of the camera, with --last")
     wanted = parser.parse_args()
+    if wanted.last:
+        lasting(wanted)
+        return
     found = trial(sv.open_source(wanted.source, frames=wanted.frames), wanted.every, wanted.seed, **overrides(wanted))
     if wanted.json:
         print(json.dumps(found))
@@ -39,6 +53,30 @@ def main() -> None:
     for kind, row in found["bad"].items():
         shares = "".join(f"{row[name]:9.3f}" for name in ("refused", "harmless", "left"))
         print(f"{kind:24}{row['frames']:7}{shares}  {row['reasons'] or ''}")
+
+
+def lasting(wanted: argparse.Namespace) -> None:
+    """Print, for each hall, what became of lasting faults and of changes."""
+    begin, end = map(int, wanted.seeds.split(":"))
+    rows = []
+    for seed in range(begin, end):
+        tried = Trial(seed, wanted.clouds, **overrides(wanted))
+        for kind in FAULTS:
+            found = asdict(tried.fault(kind, wanted.last))
+            rows.append({"seed": seed, "fault": kind, **found})
+            if not wanted.json:
+                told = "".join(
+                    f"{found['accepted'][s]:8}{found['freed'][s]:8}{found['changed'][s]:8}" for s in wanted.last
+                )
+                print(f"{seed:4} {kind:22}{told}  {found['reasons'] or ''}", flush=True)
+        for kind in CHANGES:
+            found = tried.change(kind)
+            rows.append({"seed": seed, "change": kind, **found})
+            if not wanted.json:
+                told = f"refused {sum(found['refused'].values()):4}, longest {found['longest_s']:5.1f} s"
+                print(f"{seed:4} {kind:22}{told}, taken {found['taken']:.3f} of {found['cells']}", flush=True)
+    if wanted.json:
+        print(json.dumps(rows))
 
 
 if __name__ == "__main__":

@@ -26,12 +26,41 @@ OPTICAL = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
 
 
 def main() -> None:
-    """Draw all four."""
+    """Draw all five."""
     demo()
     loops()
     plt.rcParams.update({"font.size": 11, "text.color": INK, "svg.fonttype": "path", "svg.hashsalt": "stereovox"})
     save(frames(), "frames.svg")
     save(cells_and_pixels(), "cells.svg")
+    save(changed_world(), "changed_world.svg")
+
+
+def changed_world() -> plt.Figure:
+    """Draw, from above, what two glances show of a thing in the world, of a fault in the camera, and of noise."""
+    figure, panels = plt.subplots(1, 3, figsize=(10, 3.6), facecolor=PAPER)
+    random, across = np.random.default_rng(1), np.linspace(-0.5, 0.5, 9)
+    cameras = np.array([[0.0, 0.0], [0.9, 0.5]])
+    thing = np.column_stack([across + 0.6, np.full(9, 2.2)])
+    stuck = np.column_stack([0.5 * across, np.full(9, 1.0)])
+    seen = {
+        "in the world: believed": [thing, thing + np.array([0, 0.04])],
+        "in the camera: a fault": [stuck + camera for camera in cameras],
+        "nowhere twice: a fault": [
+            np.column_stack([1.6 * across, random.uniform(0.7, 2.8, 9)]) + camera for camera in cameras
+        ],
+    }
+    for panel, (title, dots) in zip(panels, seen.items(), strict=True):
+        panel.plot([-1.4, 2.4], [3.2, 3.2], color=INK, lw=4)
+        for camera, points, colour in zip(cameras, dots, (X, Z), strict=True):
+            for side in (-0.6, 0.6):
+                panel.plot(
+                    [camera[0], camera[0] + side * 3], [camera[1], camera[1] + 3], color=colour, lw=0.6, alpha=0.5
+                )
+            panel.plot(*camera, marker="^", color=colour, ms=11)
+            panel.plot(*points.T, ".", color=colour, ms=8)
+        panel.set(title=title, xlim=(-1.5, 2.5), ylim=(-0.3, 3.4), aspect="equal")
+        panel.axis("off")
+    return figure
 
 
 def demo() -> None:

@@ -69,7 +69,7 @@ others += [replace(f, depth=0.5 * f.depth) for f in frames if others]  # they di
 cameras, allowed, later, doubted = set(), set(), set(), not others
 for seen in [*(scans(frames) if grid else frames), *others]:
     refused = mapper.add(seen).refused
-    assert refused in (None, "no_time", "disagrees_with_map"), refused
+    assert refused in (None, "no_time", "disagrees_with_map", "contradicts_map"), refused
     doubted |= refused == "disagrees_with_map"
     camera = getattr(seen, "camera", getattr(seen, "pair", None))
     if camera not in cameras:  # its first frame may compile

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the evidence of a frame with the map before the map takes it in, also from nearby poses."""
+"""Compare the evidence of a frame with the map before the map takes it in; what contradicts it is looked at closely."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +13,51 @@ from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
-from stereovox.integrate import Integration
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.evidence import Evidence
 from stereovox.se3 import Transform, apart, rotation_matrix
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.noise import RangeNoise
+from stereovox.trust.disagreement import EXPLAINED, FEW, Sight
 from stereovox.trust.gate import Gate, Passed
+from stereovox.trust.glance import Glance, Votes
+from stereovox.trust.history import Doubt
 
 SURFACES = (State.OCCUPIED, State.TENTATIVE)
-POINTS, BESIDE = 600, 3
+FIRM = 0.4
+"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
+GLANCED, POINTS, TRIED = 2000, 500, 100
+"""Most points of a frame in doubt that a glance keeps, that are looked at in the map, and that faults are tried on."""
+KNOWN = 0.1
+"""Share of the points that must lie in what the map knows."""
+BLUR = 1.5
+"""Tolerance from glance to glance, as a multiple of that towards the map: both are noisy."""
+GAIN = 0.1
+"""Share of its points by which a frame must agree better under a fault, however little there is to explain."""
+DEEP_CELLS = 4
+"""Cells from a surface that is seen through to what is seen behind it; a floor seen at a flat angle is thick."""
+REACH = 60.0
+"""Metres along a ray within which the map's first surface is sought."""
+
+MIRRORED = {
+    "mirrored": (-1, 1, 1),
+    "upside down": (1, -1, 1),
+    "turned by half": (-1, -1, 1),
+    "back to front": (1, 1, -1),
+}
+TURNS_DEG = (-32, -24, -16, -8, 8, 16, 24, 32)
+STRETCHES = (0.67, 0.77, 0.87, 1.15, 1.3, 1.5)
+
+ALIGNED, BESIDE = 300, 3
 """Most pixels that are registered with the map, and the distance in pixels of the neighbours for their normals."""
 AROUND, FLAT = 16, 0.1
 """Points of a cloud that give one its normal, and how flat they must lie: their spreads across and along."""
-STEPS = 30
-"""Iterations of the registration."""
+DENSE = 4000
+"""Most points of a cloud among which these are sought."""
+STEPS, EVERY = 20, 3
+"""Iterations of the registration, and of how many frames in doubt one is registered."""
 REACH_M, REACH_CELLS = 0.6, 2.0
 """Search radius of a point for its surface in the first iteration (metres) and in the last (cells)."""
 MIN_POINTS = 30
@@ -37,10 +66,20 @@ MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
 """How far a knocked camera may stand from its pose."""
 DAMPING = 1e-3
 """Damping of the least squares, for motions that no surface constrains."""
-SUBCELL = (0.5, 0.25)
-"""Steps, in cells, of the search for the pose that agrees best."""
-FIRM = 0.4
-"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
+
+
+def _faults() -> dict[str, NDArray[np.float64]]:
+    """Return what each fault makes of points in the sensor's frame: a matrix (3, 3)."""
+    turns = [(f"turned by {deg} deg", np.radians(deg) * axis) for axis in np.eye(3) for deg in TURNS_DEG]
+    return {
+        **{name: np.diag(signs).astype(float) for name, signs in MIRRORED.items()},
+        **{f"{name} about {'xyz'[n // len(TURNS_DEG)]}": rotation_matrix(by) for n, (name, by) in enumerate(turns)},
+        **{f"seen with a focal length x {1 / k:.2g}": np.diag([k, k, 1.0]) for k in STRETCHES},
+        **{f"stretched along z by {1 / k:.2g}": np.diag([1.0, 1.0, k]) for k in STRETCHES},
+    }
+
+
+FAULTS = _faults()
 
 
 class Comparison:
@@ -49,40 +88,128 @@ class Comparison:
     def __init__(self, config: Config, gate: Gate):
         self._gate, self._compares = gate, config.trust.max_disagreement < 1
         self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+        self._noise = PerCamera(partial(RangeNoise.of, config.noise))
         self._prepared = False
 
     def check(
-        self,
-        frame: AnyFrame,
-        image: AnyImage,
-        evidence: Evidence,
-        passed: Passed,
-        integrator: Integration,
-        voxel_map: VoxelMap,
-    ) -> tuple[Evidence, Passed]:
-        """Return the evidence to add, and what the gate needs to accept the frame.
+        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: Passed, voxel_map: VoxelMap
+    ) -> Passed:
+        """Return what the gate needs to accept the frame.
 
-        evidence: what `integrator` made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
+        evidence: what was made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
         `Gate.check_agreement`.
         """
         if not self._compares:
-            return evidence, passed
+            return passed
         self._prepare(voxel_map, image)
-        firm, fits = self._firm[image.camera], False
-        against = voxel_map.storage.agreement(evidence, firm).against
-        limit = self._gate.limit_elsewhere(passed, against)
-        if limit is not None:
-            fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
-            evidence = integrator.evidence(image)  # again: each call reuses the memory of the one before
+        against = voxel_map.storage.agreement(evidence, self._firm[image.camera]).against
         with voxel_map.lock:
-            passed = self._gate.check_agreement(frame, passed, against, fits)
-        return evidence, passed
+            doubted = self._gate.in_doubt(passed, against)
+            sight = self._sight(image, self._gate.doubt(passed), voxel_map) if doubted else None
+            return self._gate.check_agreement(frame, passed, against, sight)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
-        """Register the first image, so that kernels compile then and not when a frame is in doubt."""
+        """Look at the first image once, so that kernels compile then and not when a frame is in doubt."""
         if not self._prepared:
             self._prepared = True
+            self._sight(image, None, voxel_map)
             pose_on_surfaces(voxel_map, image)
+
+    def _sight(self, image: AnyImage, doubt: Doubt | None, voxel_map: VoxelMap) -> Sight:
+        """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
+        T, seen = image.T_world_sensor, _sampled(image, GLANCED)
+        points = _thinned(seen, POINTS)
+        tolerance = np.maximum(voxel_map.voxel_size, self._noise[image.camera].sigma(np.linalg.norm(points, axis=1)))
+        placed = _placed(voxel_map, T, points, tolerance)
+        against = placed.against
+        known = np.count_nonzero(placed.agrees | against)
+        anchored = np.count_nonzero(placed.agrees) / known if known >= max(FEW, KNOWN * len(points)) else None
+        votes, frames = Votes(), 0
+        if doubt is not None and doubt.glance is not None:
+            votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
+        fault = _fault(voxel_map, image, points, tolerance, placed, align=frames % EVERY == 0)
+        return Sight(
+            anchored, fault, np.count_nonzero(against), np.count_nonzero(placed.behind), votes, Glance.at(seen, T)
+        )
+
+
+class Placed(NamedTuple):
+    """Where points (N,) lie in the map.
+
+    agrees: on a surface. against: in what is known to be free, or behind an occupied cell and on no surface. behind:
+    on a surface, seen through an occupied cell before it. lengths: how often the ray to a point fits between the
+    sensor and the map's first surface along it, inf where there is none.
+    """
+
+    agrees: NDArray[np.bool_]
+    against: NDArray[np.bool_]
+    behind: NDArray[np.bool_]
+    lengths: NDArray[np.float64]
+
+
+def _placed(voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
+    """Return where points (N, 3) in the sensor's frame lie in the map."""
+    if not len(points):
+        return Placed(*(np.zeros(0, bool),) * 3, np.zeros(0))
+    rays = points @ T[:3, :3].T
+    away = np.linalg.norm(points, axis=1)
+    agrees = _on_surface(voxel_map, T, points, tolerance)
+    first = voxel_map.cast_rays(np.broadcast_to(T[:3, 3], rays.shape), rays, REACH).distance.astype(float)
+    gap = away - np.where(np.isfinite(first), first, np.inf)
+    through = gap > tolerance + DEEP_CELLS * voxel_map.voxel_size
+    midway = np.where(through, (1 - 0.5 * gap / away), 1.0)
+    between = voxel_map.state(T[:3, 3] + rays * midway[:, None]) == State.FREE
+    free = voxel_map.state(T[:3, 3] + rays) == State.FREE
+    return Placed(agrees, ~agrees & (through | free), agrees & through & between, first / away)
+
+
+def _on_surface(
+    voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which points (..., 3) in the sensor's frame lie on a surface, give or take (...) metres along the ray."""
+    step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
+    tries = np.stack([points * (1 - step), points, points * (1 + step)])
+    placed = tries.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    return (voxel_map.state(placed).reshape(tries.shape[:-1]) >= State.TENTATIVE).any(axis=0)
+
+
+def _fault(
+    voxel_map: VoxelMap,
+    image: AnyImage,
+    points: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    placed: Placed,
+    align: bool,
+) -> str:
+    """Return the fault under which points (N, 3) would lie on the map's surfaces, "" where there is none.
+
+    Tried are those of `FAULTS`, depths too large or too small by a factor or by some metres, and a sensor that stands
+    elsewhere; the last only if `align`, for it takes longest.
+    """
+    points, tolerance, lengths = (_thinned(values, TRIED) for values in (points, tolerance, placed.lengths))
+    found = np.isfinite(lengths) & (lengths > 0)
+    if not found.any():
+        return ""
+    times = float(np.median(lengths[found]))
+    away = np.linalg.norm(points, axis=1)
+    metres = float(np.median((lengths - 1)[found] * away[found]))
+    tried = [
+        *(points @ matrix.T for matrix in FAULTS.values()),
+        times * points,
+        points * (1 + metres / away)[:, None],
+    ]
+    names = [*FAULTS, f"its depths x {1 / times:.2g}", f"its depths {-metres:+.2g} m"]
+    T = image.T_world_sensor
+    shares = _on_surface(voxel_map, T, np.stack(tried), np.broadcast_to(tolerance, (len(tried), len(points)))).mean(1)
+    as_it_is = float(_on_surface(voxel_map, T, points, tolerance).mean())
+    enough = as_it_is + max(EXPLAINED * (1 - as_it_is), GAIN)
+    best = int(shares.argmax())
+    if shares[best] >= enough:
+        return "moved" if " about " in names[best] else names[best]
+    pose = pose_on_surfaces(voxel_map, image) if align else None
+    if pose is not None and _on_surface(voxel_map, pose, points, tolerance).mean() >= enough:
+        return "moved"
+    return ""
 
 
 def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
@@ -108,12 +235,27 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     return T if elsewhere else None
 
 
+def _sampled(image: AnyImage, most: int) -> NDArray[np.float64]:
+    """Return some of the image's points (N, 3) in the sensor's frame, about `most` at most."""
+    if isinstance(image, CheckedCloud):
+        return _thinned(image.ends[image.hits], most)
+    step = max(1, round((image.depth_m.size / most) ** 0.5))
+    rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
+    points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """Return every n-th of values (N, ...), at most `most` of them."""
+    return values[:: max(1, -(-len(values) // most))]
+
+
 def _surfaces(image: AnyImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the sensor's frame."""
     if isinstance(image, CheckedCloud):
         return _surfaces_of_cloud(image.ends[image.hits])
     height, width = image.depth_m.shape
-    step = max(1, round((image.depth_m.size / POINTS) ** 0.5))
+    step = max(1, round((image.depth_m.size / ALIGNED) ** 0.5))
     rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
     v, u = np.meshgrid(rows, columns, indexing="ij")
     here = _points(image, v, u)
@@ -131,7 +273,8 @@ def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
     if len(points) < AROUND:
         return np.empty((0, 3)), np.empty((0, 3))
-    some = points[:: max(1, len(points) // POINTS)]
+    points = _thinned(points, DENSE)
+    some = _thinned(points, ALIGNED)
     _, near = KDTree(points).query(some, AROUND)
     arms = points[near] - points[near].mean(axis=1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", arms, arms))
@@ -158,30 +301,6 @@ def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDA
     T[:3, :3] = rotation_matrix(turn)
     T[:3, 3] = middle + shift - T[:3, :3] @ middle
     return T
-
-
-def _fits_elsewhere(image: AnyImage, integrator: Integration, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
-    """Return whether an image disagrees with the map by at most `limit` from where its surfaces lie on the map's.
-
-    Registered with the centres of cells it may be half a cell off; from there the pose of least disagreement is sought
-    along the world's axes.
-    """
-    pose = pose_on_surfaces(voxel_map, image)
-    if pose is None:
-        return False
-
-    def against_from(T: Transform) -> float:
-        against = voxel_map.storage.agreement(integrator.evidence(replace(image, T_world_sensor=T)), firm).against
-        return 1.0 if against is None else against
-
-    least = against_from(pose)
-    for step in SUBCELL if least > limit else ():
-        for shift in step * voxel_map.voxel_size * np.vstack([np.eye(3), -np.eye(3)]):
-            moved = pose.copy()
-            moved[:3, 3] += shift
-            if (against := against_from(moved)) < least:
-                least, pose = against, moved
-    return least <= limit
 
 
 def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera | Lidar) -> int:

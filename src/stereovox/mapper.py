@@ -148,7 +148,7 @@ class Mapper:
             prepared = perf_counter()
             passed = offer.check(image)
             evidence = quality.integrator.evidence(image)
-            evidence, passed = self._comparison.check(frame, image, evidence, passed, quality.integrator, self.map)
+            passed = self._comparison.check(frame, image, evidence, passed, self.map)
             packed = self._packed(depth_frame, passed)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)

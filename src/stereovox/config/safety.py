@@ -25,9 +25,9 @@ class TrustConfig(Section):
     max_disagreement: share of a frame's evidence on sure cells that may contradict the map, beyond what is usual for
         its sensor; 1: not checked.
     pose_error_m: occasional error of poses in metres; a frame may disagree by that over the size of a cell.
-    changed_s: a changed world is accepted after this many seconds of frames that disagree with the map, at least five
-        of them; 0: at once.
-    moved_s: seconds after which frames are accepted that would agree with the map from another pose.
+    changed_s: least seconds of frames that disagree with the map after which a changed world is accepted, if they show
+        one; time alone is no evidence.
+    moved_s: seconds after which frames are accepted that would agree with the map from another pose; not set: never.
     """
 
     ordered: bool = True
@@ -46,7 +46,7 @@ class TrustConfig(Section):
     max_disagreement: float = Field(0.15, gt=0, le=1)
     pose_error_m: float = Field(0.0075, ge=0)
     changed_s: float = Field(1.0, ge=0, le=1e9)
-    moved_s: float = Field(5.0, ge=0, le=1e9)
+    moved_s: float | None = Field(None, ge=0, le=1e9)
 
     @model_validator(mode="after")
     def _ordered(self) -> TrustConfig:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The last check before a frame may change the map: does it agree with the frames before it, and with the map?
 
-`Gate` compares stamps, poses and images; `DisagreementMonitor` judges how far the evidence contradicts the map.
+`Gate` compares stamps, poses and images; `trust.disagreement` judges how far the evidence contradicts the map.
 """
 
 from __future__ import annotations
@@ -16,18 +16,8 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.se3 import apart
-from stereovox.trust.history import (
-    CHANGED,
-    MAX_NAME_LENGTH,
-    MAX_SENSORS,
-    MOVED,
-    Doubt,
-    History,
-    Look,
-    RunningMean,
-    Seen,
-    Streak,
-)
+from stereovox.trust.disagreement import Agreement, DisagreementMonitor, Sight
+from stereovox.trust.history import MAX_NAME_LENGTH, MAX_SENSORS, Doubt, History, Look, Seen, Streak
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
 """Pose noise: a step this small is no jump, however short the time."""
@@ -41,38 +31,6 @@ DIGEST_POINTS = 1024
 ROUGH, ROUGH_SHARE = 1e-3, 0.2
 """Measured inverse depth bends by at least this share of itself, at this share of the pixels; walls without noise do
 not, and look the same from many places."""
-
-REASONS = {"": "disagrees_with_map", CHANGED: "disagrees_with_map", MOVED: "camera_moved"}
-"""Refusal reason for each verdict on a doubt."""
-USUAL_AT_FIRST, USUAL_GAIN = RunningMean(0.25, 0.06), 0.2
-"""Disagreement assumed of a new sensor, and the weight of each frame in the exponential mean."""
-SPREADS = 4
-"""Spreads above the mean that are still usual."""
-MAX_LIMIT = 0.8
-"""Disagreement that is too much, whatever is usual."""
-AGAIN = 0.6
-"""Share of the tolerance above the usual that a frame may use to end a doubt: it must clearly agree."""
-SOON_S, LATE_S = 0.2, 1.0
-"""A frame that comes later than SOON_S after the one before may disagree more: up to twice as much LATE_S later. It
-sees much that is new, and the world had time to change."""
-MIN_FRAMES = 5
-"""Frames that must disagree before a verdict, however far apart they were taken."""
-FITS = 1 / 3
-"""Share of doubted frames that must agree from another pose for the verdict MOVED; for some, no such pose is found."""
-UNTIMED_HZ = 30
-"""Frame rate assumed where stamps stand still."""
-
-
-class Agreement(NamedTuple):
-    """How an accepted frame agrees with the map.
-
-    against: its disagreement, None where too little is known. doubt: the doubt that remains. after: the reason of the
-    refusals that this acceptance ends, "" where there were none.
-    """
-
-    against: float | None
-    doubt: Doubt | None = None
-    after: str = ""
 
 
 class Passed(NamedTuple):
@@ -127,16 +85,20 @@ class Gate:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
         return passed
 
-    def limit_elsewhere(self, passed: Passed, against: float | None) -> float | None:
-        """Return as `DisagreementMonitor.limit_elsewhere`."""
-        return self._monitor.limit_elsewhere(passed.sensor, passed.seen.stamp_ns, against)
+    def in_doubt(self, passed: Passed, against: float | None) -> bool:
+        """Return as `DisagreementMonitor.in_doubt`."""
+        return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
 
-    def check_agreement(self, frame: AnyFrame, passed: Passed, against: float | None, fits: bool) -> Passed:
+    def doubt(self, passed: Passed) -> Doubt | None:
+        """Return the doubt that frames of its sensor are in, None where they agree."""
+        return self._history.doubts.get(passed.sensor)
+
+    def check_agreement(self, frame: AnyFrame, passed: Passed, against: float | None, sight: Sight | None) -> Passed:
         """Return what `accept` needs of a frame that was compared with the map.
 
         Arguments and errors: as `DisagreementMonitor.check`.
         """
-        agreement = self._monitor.check(frame, passed.sensor, passed.seen.stamp_ns, against, fits)
+        agreement = self._monitor.check(frame, passed.sensor, passed.seen.stamp_ns, against, sight)
         return passed._replace(agreement=agreement, after=passed.after or agreement.after)
 
     def accept(self, passed: Passed) -> None:
@@ -237,106 +199,6 @@ class Gate:
         return (
             f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
         )
-
-
-class DisagreementMonitor:
-    """Compares each frame's disagreement with the map with that of its sensor's recent frames, kept in `history`.
-
-    A frame that disagrees more is refused. Once at least MIN_FRAMES have done so for `trust.changed_s`, the world has
-    changed: they are accepted until they agree again. But where they would agree from another pose, the camera was
-    moved or its tracker is wrong: frames are refused until they agree again, or have disagreed for `trust.moved_s`.
-    So are frames that see nothing known while others are in doubt, for the next ones would agree with those. Other
-    frames that see nothing known cannot be judged, and are accepted.
-    """
-
-    def __init__(self, config: Config, history: History):
-        self._history, self._trust = history, config.trust
-        self._excess = max(config.trust.max_disagreement, config.trust.pose_error_m / config.voxel_size)
-        self._changed_ns = round(1e9 * config.trust.changed_s)
-        self._moved_ns = round(1e9 * config.trust.moved_s)
-
-    def limit(self, sensor: str, stamp_ns: int, share: float = 1.0) -> float:
-        """Return how far a frame may disagree with the map, 0 to 1; `share`: of the tolerance above the usual."""
-        mean, spread = self._history.usual.get(sensor, USUAL_AT_FIRST)
-        late_s = 1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S
-        share *= 1 + min(max(late_s / LATE_S, 0.0), 1.0)
-        return min(mean + share * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
-
-    def limit_elsewhere(self, sensor: str, stamp_ns: int, against: float | None) -> float | None:
-        """Return how far a frame may disagree from another pose, None where it need not be compared from there.
-
-        Frames are compared that disagree while it is open whether the world has changed or the camera was moved.
-        """
-        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
-        settled = (
-            (doubt is not None and doubt.verdict) or against is None or self._agrees(doubt, sensor, stamp_ns, against)
-        )
-        return None if settled else limit
-
-    def check(self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, fits: bool) -> Agreement:
-        """Return what `accept` needs once the map has changed.
-
-        against: share of the frame's evidence that contradicts the map, None where too little is known. fits: whether
-        it would agree from another pose (`limit_elsewhere`). Raises FrameRefused: `disagrees_with_map`,
-        `camera_moved`.
-        """
-        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
-        if against is None and (doubt is None or doubt.verdict == CHANGED):
-            return Agreement(None, doubt)
-        if against is not None and self._agrees(doubt, sensor, stamp_ns, against):
-            return Agreement(against)
-        waited = doubt is not None and doubt.verdict == CHANGED
-        doubt = self._judged(Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns), fits)
-        enough_ns = self._moved_ns if doubt.verdict == MOVED else self._changed_ns
-        if self._lasted(doubt, enough_ns):
-            return Agreement(against, doubt._replace(verdict=CHANGED), "" if waited else REASONS[doubt.verdict])
-        self._remember(sensor, doubt)
-        raise self._refusal(frame, against, limit, doubt)
-
-    def accept(self, sensor: str, agreement: Agreement) -> None:
-        """Remember a frame that the map took in."""
-        if agreement.doubt is not None:
-            self._remember(sensor, agreement.doubt)
-        elif agreement.against is not None:
-            self._history.doubts.pop(sensor, None)
-            usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-            self._history.usual[sensor] = usual.updated(agreement.against, USUAL_GAIN)
-
-    def _last_ns(self, sensor: str, now_ns: int) -> int:
-        """Return the stamp of the frame before, accepted or in doubt; `now_ns` where there is none."""
-        stamps_ns = [self._history.doubts[sensor].last_ns] if sensor in self._history.doubts else []
-        stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
-        return max(stamps_ns, default=now_ns)
-
-    def _agrees(self, doubt: Doubt | None, sensor: str, stamp_ns: int, against: float) -> bool:
-        return against <= self.limit(sensor, stamp_ns, AGAIN if doubt else 1.0)
-
-    def _judged(self, doubt: Doubt, fits: bool) -> Doubt:
-        """Return a doubt with its verdict, once it has lasted long enough for one."""
-        if doubt.verdict:
-            return doubt
-        doubt = doubt._replace(fits=doubt.fits + fits)
-        if not self._lasted(doubt, self._changed_ns):
-            return doubt
-        return doubt._replace(verdict=MOVED if doubt.fits >= FITS * (doubt.frames + 1) else CHANGED)
-
-    def _lasted(self, doubt: Doubt, enough_ns: float) -> bool:
-        return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns and (doubt.frames >= MIN_FRAMES or enough_ns == 0)
-
-    def _remember(self, sensor: str, doubt: Doubt) -> None:
-        if sensor in self._history.doubts or len(self._history.doubts) < MAX_SENSORS:
-            self._history.doubts[sensor] = doubt
-
-    def _refusal(self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt) -> FrameRefused:
-        if doubt.verdict == MOVED:
-            detail = "it would agree with the map from elsewhere; calibrate where the camera is, or reset the tracker"
-        else:
-            detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
-        if against is None:
-            detail = "nothing that it sees is known, and frames just before it disagree with the map"
-        seconds = self._trust.moved_s if doubt.verdict == MOVED else self._trust.changed_s
-        detail += f"; accepted once frames agree for {seconds:g} s"
-        return FrameRefused(REASONS[doubt.verdict], f"{name_of(frame)}: {detail}")
 
 
 def _rows(image: np.ndarray) -> np.ndarray:

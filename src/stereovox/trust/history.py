@@ -15,6 +15,7 @@ import numpy as np
 from stereovox.errors import one_line, shortened
 from stereovox.trust.camera_path import FARTHEST, CameraPath
 from stereovox.trust.camera_path import Seen as Seen
+from stereovox.trust.glance import Glance
 from stereovox.trust.loop_lines import LoopLines
 
 MAX_SENSORS = 64
@@ -61,7 +62,8 @@ class RunningMean(NamedTuple):
 class Doubt(NamedTuple):
     """Frames of one sensor that disagree with the map: stamps of the first and the last, and how many follow the first.
 
-    fits: how many of them would agree from another pose. verdict: CHANGED or MOVED; "" while it is open.
+    fits: how many of them would agree from another pose. verdict: CHANGED or MOVED; "" while it is open. looks: how
+    many of the last ones in a row showed a changed world. glance: what the next one is compared with.
     """
 
     since_ns: int
@@ -69,6 +71,8 @@ class Doubt(NamedTuple):
     frames: int = 0
     fits: int = 0
     verdict: str = ""
+    looks: int = 0
+    glance: Glance | None = None
 
     def going_on(self, stamp_ns: int) -> Doubt:
         """Return the doubt after one more frame."""
@@ -184,7 +188,7 @@ class History:
                 },
                 "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
                 "usual": {name: list(usual) for name, usual in self.usual.items()},
-                "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
+                "doubts": {name: _doubt_to(doubt) for name, doubt in self.doubts.items()},
             },
             "camera_path": self.path.saved(),
             "loops": None if self.loops is None else self.loops.saved(),
@@ -277,12 +281,19 @@ def _look_from(saved: Any) -> Look:
     return Look(_whole(saved["digest"], "history: digest"), _pose_from(saved["pose"]))
 
 
+def _doubt_to(doubt: Doubt) -> dict[str, Any]:
+    glance = None if doubt.glance is None else {"pose": list(doubt.glance.pose), "ranges": doubt.glance.packed()}
+    return {**doubt._asdict(), "glance": glance}
+
+
 def _doubt_from(saved: Any) -> Doubt:
     since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
-    frames, fits = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits"))
+    frames, fits, looks = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits", "looks"))
     if saved["verdict"] not in ("", CHANGED, MOVED):
         raise ValueError("history: a doubt has no such verdict")
-    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
+    glance = saved["glance"]
+    seen = None if glance is None else Glance.unpacked(_pose_from(glance["pose"]), glance["ranges"])
+    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"], looks, seen)
 
 
 def _usual_from(saved: Any) -> RunningMean:

@@ -9,6 +9,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.lab.checks.bad_images import Trial, bad_frames, displaced, metres, trial
+from stereovox.se3 import look_at
 from stereovox.simulate.passer_by import PasserBy
 from stereovox.simulate.scene import box
 
@@ -88,36 +89,49 @@ def test_a_knocked_camera_is_not_believed_until_it_agrees_again():
 
 
 class Changing(PasserBy):
-    """A wall with a cupboard before it, from frame to frame there or not."""
+    """A wall with a cupboard before it, from frame to frame there or not; the camera stands, or moves to and fro."""
 
-    def __init__(self):
+    def __init__(self, moves):
         super().__init__("near", image_width=318)
+        self.moves = moves
 
     def at(self, i, cupboard):
-        solids = self._surroundings + ([box("cupboard", "cupboard", (2.2, -3, 0), (2.6, 3, 3))] if cupboard else [])
+        solids = self._surroundings + ([box("cupboard", "cupboard", (2.2, -1, 0), (2.6, 1, 3))] if cupboard else [])
+        eye = np.array([0, 0, 1.2]) + self.moves * np.sin(i / 15) * np.array([0.6, 0.4, 0])
+        self.T_world_camera = look_at(eye, eye + np.array([1, 0, 0]))
         depth, reason = self._device.measure(self._rendered(solids), [0, i])
         return sv.Frame(depth, self.camera, self.T_world_camera, i * 33_333_333, 0.001, reason)
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_a_world_that_has_changed_is_believed_after_a_second(before):
-    """Furniture that fills most of the view has come, or gone."""
-    source = Changing()
+def test_a_world_that_has_changed_is_believed_within_three_seconds(before):
+    """Furniture that fills half of the view has come, or gone. What has come is near: few cells, so at once."""
+    source = Changing(moves=True)
     mapper = sv.Mapper(voxel_size=0.1)
-    for i in range(20):
+    for i in range(60):
         assert mapper.add(source.at(i, before)).refused is None
-    cells = mapper.map.storage.blocks()[1].tobytes()
-    reports = [mapper.add(source.at(i, not before)) for i in range(20, 70)]
+    reports = [mapper.add(source.at(i, not before)) for i in range(60, 150)]
     refused = [report.refused for report in reports]
     late = refused.index(None)
-    assert 29 <= late <= 31
-    assert set(refused[:late]) == {"disagrees_with_map"}
-    assert "disagrees_with_map" in reports[late].detail
-    assert refused[late:] == [None] * (50 - late)
-    assert mapper.map.history.settled == {"disagrees_with_map": 1}
+    assert 29 <= late <= 60 if before else late == 0
+    assert set(refused[:late]) <= {"disagrees_with_map", "contradicts_map"}
+    assert refused[late:] == [None] * (90 - late)
+    assert mapper.map.history.settled.total() == before
     face = [[2.25, y, z] for y in (-0.5, 0.5) for z in (1.0, 1.5)]
     assert set(mapper.map.state(face).tolist()) == {int(sv.State.FREE if before else sv.State.OCCUPIED)}
-    assert cells != mapper.map.storage.blocks()[1].tobytes()
+
+
+def test_a_camera_that_stands_cannot_tell_a_change_from_a_fault():
+    source = Changing(moves=False)
+    mapper = sv.Mapper(voxel_size=0.1)
+    for i in range(20):
+        mapper.add(source.at(i, True))
+    cells = mapper.map.storage.blocks()[1].tobytes()
+    reports = [mapper.add(source.at(i, False)) for i in range(20, 70)]
+    assert [report.refused for report in reports[31:]] == ["contradicts_map"] * 19
+    assert "move the sensor" in reports[-1].detail
+    assert mapper.health().refused["contradicts_map"] >= 19
+    assert cells == mapper.map.storage.blocks()[1].tobytes()
 
 
 WINDOWS = {

@@ -88,7 +88,7 @@ class Trial:
         image = self._image(frame)
         passed = self._gate.check(frame, image)
         evidence = self.quality.integrator.evidence(image)
-        return image, *self._comparison.check(frame, image, evidence, passed, self.quality.integrator, self.map)
+        return image, evidence, self._comparison.check(frame, image, evidence, passed, self.map)
 
     def _image(self, frame: AnyFrame) -> DepthImage:
         return self.quality.depth.image(self.quality.depth.matched(frame))

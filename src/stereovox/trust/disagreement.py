@@ -69,6 +69,11 @@ class Sight(NamedTuple):
     glance: Glance
 
     @property
+    def off(self) -> float | None:
+        """Share of its points on what is known that do not agree; None where they are too few."""
+        return None if self.anchored is None else 1 - self.anchored
+
+    @property
     def told(self) -> int:
         """How many points tell a changed world from a fault."""
         return self.votes.world + self.votes.sensor + self.votes.neither
@@ -154,9 +159,10 @@ class DisagreementMonitor:
         if sight is None:
             return Agreement(against, before if against is None else None)
         limit = self.limit(sensor, stamp_ns)
-        if against is None and sight.anchored is not None and 1 - sight.anchored <= limit and not sight.fault:
-            return Agreement(1 - sight.anchored)
         doubt = Doubt(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
+        lasted = self._lasted(doubt, self._changed_ns)
+        if against is None and lasted and sight.off is not None and sight.off <= limit and not sight.fault:
+            return Agreement(sight.off)  # it sees little of the known, but that agrees
         doubt = self._judged(doubt, sight)
         if doubt.verdict == CHANGED:
             waited = before is not None and before.verdict == CHANGED

@@ -14,7 +14,8 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
 from stereovox.threads import MapLock
 from stereovox.trust.gate import Gate, Passed
-from stereovox.trust.health import FULL, HealthMonitor
+from stereovox.trust.health import FULL, Health, HealthMonitor
+from stereovox.trust.stamp_clock import StampsBy
 
 
 class Intake:
@@ -24,11 +25,19 @@ class Intake:
 
     Attributes:
         gate: Compares each frame with those before it; its memory is the map's history.
-        monitor: Records when each frame arrived and what became of it.
+        monitor: Records when each frame was taken and arrived, and what became of it.
     """
 
-    def __init__(self, config: Config, target: VoxelMap | GridMap, clock: Callable[[], int]):
-        self.gate, self.monitor = Gate(config, target.history), HealthMonitor(config, clock)
+    def __init__(
+        self,
+        config: Config,
+        target: VoxelMap | GridMap,
+        clock: Callable[[], int],
+        stamps_by: StampsBy,
+        epoch: Callable[[], int],
+    ):
+        self.gate = Gate(config, target.history)
+        self.monitor = HealthMonitor(config, clock, stamps_by, epoch)
         self._map, self._adding = target, MapLock()
 
     def offer(self, frame: AnyFrame | Scan) -> Offer:
@@ -44,6 +53,58 @@ class Intake:
     def closed(self) -> AbstractContextManager[object]:
         """Return what lets no frame in while it is entered."""
         return self._adding
+
+
+class Aged:
+    """What mappers say of their map's age, by their `_intake`."""
+
+    _intake: Intake
+
+    def health(self, now_ns: int | None = None) -> Health:
+        """Return how current the map is.
+
+        Args:
+            now_ns: Nanoseconds by `clock`; None for now.
+
+        Returns:
+            State, age and recent refusals of the map.
+        """
+        return self._intake.monitor.health(now_ns)
+
+    @property
+    def stamp_clock(self) -> StampsBy:
+        """By which clock frames are stamped, from which `health` knows how late they come; it may be set at any time.
+
+        A function: returns the present time by that clock in nanoseconds, None while it is not known. "live": stamps
+        advance with the time, by a clock of this machine, which is recognised, or by another, of which the least delay
+        that was seen is taken for none. "replay": stamps are those of a recording, played at any speed; ages count from
+        the newest stamp. None: a clock of this machine where it is recognised, else as "replay", until an
+        `ObstacleSender` makes it "live". Setting it raises ConfigError for anything else.
+        """
+        return self._intake.monitor.stamps.by
+
+    @stamp_clock.setter
+    def stamp_clock(self, clock: StampsBy) -> None:
+        self._intake.monitor.stamps.by = clock
+
+    def heard(self, stamp_ns: int, source: str = "poses") -> None:
+        """Take note that something with a stamp came now, such as a pose: what was stamped earlier is at least as old.
+
+        Args:
+            stamp_ns: Its time in nanoseconds, by the clock of the frames' stamps.
+            source: Where it came from.
+        """
+        monitor = self._intake.monitor
+        monitor.stamps.heard(f"{source} alone", int(stamp_ns), monitor.now())
+
+    def now_ns(self) -> int:
+        """Return nanoseconds by the mapper's `clock`, which never goes back."""
+        return self._intake.monitor.now()
+
+    def age_ns(self, stamp_ns: int, came_ns: int) -> int:
+        """Return how old is what was stamped so and came at `came_ns`, by `now_ns`: at least as long as it is there."""
+        now_ns = self.now_ns()
+        return max(self._intake.monitor.stamps.age_ns(stamp_ns, now_ns), now_ns - came_ns)
 
 
 class Offer:

@@ -20,7 +20,7 @@ from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Cloud, Frame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
-from stereovox.intake import Intake
+from stereovox.intake import Aged, Intake
 from stereovox.integrate.beams import make_beams
 from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.evidence import Evidence
@@ -28,9 +28,11 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.rebuild import CorrectionReport, FramePoses, correct
+from stereovox.sources.wall_clock import epoch_ns
 from stereovox.threads import MapLock, uninterrupted
 from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
+from stereovox.trust.stamp_clock import StampsBy
 from stereovox.trust.validate import validate_upright_scan
 
 SeenT = TypeVar("SeenT", contravariant=True)
@@ -41,9 +43,11 @@ class AnyMapper(Protocol[SeenT]):
 
     Attributes:
         config: The settings.
+        stamp_clock: By which clock frames are stamped.
     """
 
     config: Config
+    stamp_clock: StampsBy
 
     @property
     def map(self) -> VoxelMap | GridMap:
@@ -91,7 +95,7 @@ class AnyMapper(Protocol[SeenT]):
         ...
 
 
-class Mapper:
+class Mapper(Aged):
     """Builds a voxel map from depth images, stereo pairs or clouds of lidars.
 
     A frame that cannot be trusted is refused and changes nothing but the count of refusals.
@@ -101,6 +105,7 @@ class Mapper:
         resume: Map to continue; the settings that give its cells their meaning must not change.
         tiles: Folder for cells that leave a window (`window.outside = "keep"`).
         clock: Returns the time in nanoseconds; used for `health`.
+        stamp_clock: By which clock frames are stamped, as the attribute `stamp_clock`.
         **overrides: Settings that replace those of the profile (`voxel_size=0.1`, `**{"sensor.p_free": 0.3}`).
 
     Attributes:
@@ -121,13 +126,14 @@ class Mapper:
         resume: VoxelMap | None = None,
         tiles: Path | None = None,
         clock: Callable[[], int] = monotonic_ns,
+        stamp_clock: StampsBy = None,
         **overrides: Any,
     ):
         self.config = on_usable_device(load_config(profile, **overrides))
         self._deadline = Deadline(self.config)
         self._levels, self._tiles, self._correcting = Levels(self.config), tiles, MapLock()
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
-        self._intake = Intake(self.config, self.map, clock)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock, epoch_ns)
         self._comparison = Comparison(self.config, self._intake.gate)
 
     def add(self, frame: AnyFrame) -> UpdateReport:
@@ -210,17 +216,6 @@ class Mapper:
         """Return what a notebook shows: the map's picture and facts."""
         return self.map._repr_html_(f"Mapper, profile '{self.config.profile}'")
 
-    def health(self, now_ns: int | None = None) -> Health:
-        """Return how current the map is.
-
-        Args:
-            now_ns: Nanoseconds by `clock`; None for now.
-
-        Returns:
-            State, age and recent refusals of the map.
-        """
-        return self._intake.monitor.health(now_ns)
-
     def save(self, path: str | Path) -> None:
         """Save the map to a folder, all or nothing, as `VoxelMap.save` does.
 
@@ -254,7 +249,7 @@ class Mapper:
             kept.keep(kept_frame(frame, packed, self.map.frames, passed.sensor, passed.seen, quality, evidence))
 
 
-class GridMapper:
+class GridMapper(Aged):
     """Builds a 2-D occupancy grid of a floor from lidar scans and depth images.
 
     A scan that cannot be trusted is refused and changes nothing but the count of refusals. Poses must be in the map's
@@ -264,6 +259,7 @@ class GridMapper:
         profile: Profile name, TOML file or `Config`.
         resume: Map to continue, in its own frame.
         clock: Returns the time in nanoseconds; used for `health`.
+        stamp_clock: By which clock frames are stamped, as the attribute `stamp_clock`.
         **overrides: Settings that replace those of the profile (`voxel_size=0.02`, `**{"grid.update": "every"}`).
 
     Attributes:
@@ -280,6 +276,7 @@ class GridMapper:
         *,
         resume: GridMap | OccupancyGrid | None = None,
         clock: Callable[[], int] = monotonic_ns,
+        stamp_clock: StampsBy = None,
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
@@ -287,7 +284,7 @@ class GridMapper:
         self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)
-        self._intake = Intake(self.config, self.map, clock)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock, epoch_ns)
 
     def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
@@ -321,17 +318,6 @@ class GridMapper:
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
         return self.map._repr_html_(f"GridMapper, profile '{self.config.profile}'")
-
-    def health(self, now_ns: int | None = None) -> Health:
-        """Return how current the map is.
-
-        Args:
-            now_ns: Nanoseconds by `clock`; None for now.
-
-        Returns:
-            State, age and recent refusals of the map.
-        """
-        return self._intake.monitor.health(now_ns)
 
     def occupancy(self) -> OccupancyGrid:
         """Return the map so far as an occupancy grid, in the form that ROS publishes.

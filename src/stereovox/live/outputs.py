@@ -12,6 +12,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Protocol
 
+import numpy as np
+
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import SphereGrid, SphereLayout, accumulate
@@ -25,6 +27,8 @@ from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
 from stereovox.safe_io import FLOOR_ENDINGS, check_file
 from stereovox.se3 import Transform, inverse
+from stereovox.sources.live_poses import LivePoses
+from stereovox.trust.health import STALE
 
 GRID_S = 1.0
 """Seconds between two writes of the 2-D map."""
@@ -50,6 +54,8 @@ class Output(Protocol):
 
 class GridFile:
     """Keeps the 2-D map of a growing map in map_server files, written anew in a thread of its own.
+
+    While the map is stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete.
 
     Args:
         mapper: The mapper whose map is projected.
@@ -78,6 +84,7 @@ class GridFile:
         self._projection, self._period_s, self._notify = LiveProjection(mapper.map, heights), period_s, notify
         self._worker = ThreadPoolExecutor(1, "stereovox-grid")
         self._busy: Future[None] | None = None
+        self._mapper, self._stale = mapper, False
         self._due, self._new = 0.0, False
         self.written, self.failure = 0, ""
 
@@ -85,7 +92,7 @@ class GridFile:
         """Write the 2-D map if that is due and the last write is done."""
         self._new |= not report.refused
         now = monotonic()
-        if self._new and now >= self._due and (self._busy is None or self._busy.done()):
+        if self._new and now >= self._due and (self._busy is None or self._busy.done()) and self._current():
             self._due = now + self._period_s
             self._write()
 
@@ -98,6 +105,14 @@ class GridFile:
     def close(self) -> None:
         """Wait for the last write."""
         self._worker.shutdown()
+
+    def _current(self) -> bool:
+        """Return whether the map is fresh enough to be written, and tell the user once where it is not."""
+        health = self._mapper.health()
+        was, self._stale = self._stale, health.state in STALE
+        if self._stale and not was:
+            self._notify(f"{self._file}: is not written anew, the map is {health.text}")
+        return not self._stale
 
     def _write(self) -> None:
         self._new = False
@@ -133,6 +148,8 @@ class LiveSphere:
         config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees where they say nothing.
         mounts: T_body_camera (4, 4) by the name of the sensor; body x forward, y left, z up.
         picture: PNG to draw at the end; None: none.
+        mapper: The mapper that takes the images; None: how old they are is not judged.
+        poses: Where newer poses of the body come from; None: those of the images are the newest.
 
     Attributes:
         failure: Why there is no picture, where one was asked for; "" when there is.
@@ -141,7 +158,15 @@ class LiveSphere:
         StereovoxError: The picture cannot be written.
     """
 
-    def __init__(self, config: Config, mounts: Mapping[str, Transform], picture: str | Path | None = None):
+    def __init__(
+        self,
+        config: Config,
+        mounts: Mapping[str, Transform],
+        picture: str | Path | None = None,
+        mapper: Mapper | None = None,
+        poses: LivePoses | None = None,
+    ):
+        self._mapper, self._poses, self._finished = mapper, poses, False
         self._picture = None if picture is None else check_file(picture, (".png",))
         self._config = load_config(config, **{"sphere.step_deg": config.sphere.step_deg or STEP_DEG})
         self._layout = SphereLayout.configured(self._config.sphere)
@@ -167,19 +192,24 @@ class LiveSphere:
         return bool(self._last)
 
     def grid(self) -> tuple[SphereGrid, int]:
-        """Return the grid of all cameras from where the body is by the newest image, and its time in nanoseconds.
+        """Return the grid of all cameras from where the body is by the newest pose, and its time in nanoseconds.
 
-        Each cell has its own stamp: what another camera saw before is older.
+        Each cell has its own stamp: what another camera saw before is older. Once the run has ended this is the grid of
+        the last image, whenever it is asked for.
 
         Raises:
-            StereovoxError: Nothing has been seen so far.
+            StereovoxError: Nothing has been seen so far, or the map is stale or lost (`Mapper.health`).
         """
         if not self._last:
             raise StereovoxError("no image has been mapped yet; ask again later")
-        return together(self._last)
+        if self._mapper is not None and not self._finished and (health := self._mapper.health()).state in STALE:
+            raise StereovoxError(f"the distances are old, the map is {health.text}; ask again later")
+        now = None if self._poses is None or self._finished else self._poses.newest
+        return together(self._last, now if now is not None and np.isfinite(now[1]).all() else None)
 
     def finish(self) -> None:
         """Draw the picture; `failure` says why it could not be written."""
+        self._finished = True
         if self._picture is None:
             return
         from stereovox.view.sphere import sphere_picture

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic_ns, perf_counter, process_time
+from time import perf_counter, process_time
 from types import TracebackType
 from typing import Any
 
@@ -174,6 +174,7 @@ class LiveRun:
         self._notify, self._resume = notify, resume
         self._open = ExitStack()
         self.outputs: list[Output] = []
+        self._newest_ns: int | None = None
         self._recorder: Recorder | None = None
         self._sender: ObstacleSender | None = None
         self.sphere: LiveSphere | None = None
@@ -193,6 +194,9 @@ class LiveRun:
                 MapRun(self.stream, self.out, poses=GIVEN, notify=self._notify, **self._map)
             )
             self.mapper = self._run.mapper
+            self.mapper.stamp_clock = self.stream.now_ns
+            if self.stream.poses is not None:
+                self.stream.poses.listen(self._pose_came)
             self.stream.config = self.mapper.config
             self._open = stack.pop_all()
         return self
@@ -222,10 +226,10 @@ class LiveRun:
         """
         if mavlink is not None:
             self._sender = self._obstacle_sender(mavlink)
-            self._add(_ToldOfPoses(self._sender, self.stream))
+            self._add(_ToldOfFrames(self._sender, self.stream))
         if sphere:
             picture = None if sphere is True else sphere
-            self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture)
+            self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture, self.mapper, self.stream.poses)
             self._add(self.sphere)
         if grid is not None:
             self._add(GridFile(self.mapper, grid, heights, notify=self._notify))
@@ -298,6 +302,18 @@ class LiveRun:
             url_or_link = url
         return ObstacleSender(self.mapper, url_or_link, tell=self._notify)
 
+    def _pose_came(self) -> None:
+        """Say what time it is by the newest pose, and where the body is."""
+        assert self.stream.poses is not None
+        newest = self.stream.poses.newest
+        if newest is None or newest[0] == self._newest_ns:
+            return
+        self._newest_ns = newest[0]
+        if self._sender is None:
+            self.mapper.heard(newest[0])
+        else:
+            self._sender.pose(newest[0], newest[1] @ inverse(T_OPTICAL_BODY))
+
     def _add(self, output: Output) -> None:
         self.outputs.append(output)
         self._open.callback(output.close)
@@ -308,8 +324,8 @@ class LiveRun:
         return GIVEN if self.stream.poses is None else self.stream.poses.where
 
 
-class _ToldOfPoses:
-    """An output that tells an autopilot's sender where the body is, and how long each image waited for its pose."""
+class _ToldOfFrames:
+    """An output that tells an autopilot's sender what the map took in, and where the body was."""
 
     def __init__(self, sender: ObstacleSender, stream: LiveStream):
         self._sender, self._stream = sender, stream
@@ -319,8 +335,7 @@ class _ToldOfPoses:
         if report.refused:
             return
         T_world_body = frame.T_world_sensor @ inverse(T_OPTICAL_BODY @ self._stream.mount(frame))
-        waited_s = (monotonic_ns() - self._stream.moment.arrived_ns) / 1e9
-        self._sender.at(orthonormalise(T_world_body), frame.sensor, waited_s)
+        self._sender.at(orthonormalise(T_world_body), frame.sensor, stamp_ns=frame.stamp_ns)
 
 
 class _Reports:

@@ -45,7 +45,7 @@ TICK_S, SOON_S = 0.1, 0.01
 """Seconds after which a stream without news says so, and after which waiting images are looked at again."""
 REMIND_S = 5.0
 """Seconds without any pose, with bad lines, or without an image of a camera, until the user is told."""
-HOST_CLOCK_NS = 5_000_000_000
+HOST_CLOCK_NS = 60_000_000_000
 """Stamps that are not older than this by the clock of this machine are believed to be by it."""
 REMEMBERED = 300
 """Arrivals that are remembered for each camera."""
@@ -204,6 +204,11 @@ class LiveStream(Stream):
             return {"cameras": cameras}
         more = dict(self._stream.counts) if self._stream is not None else {}
         return {"cameras": cameras, "poses": {"added": self.poses.added, **dict(self.poses.counts), **more}}
+
+    def now_ns(self) -> int | None:
+        """Return the present time by the clock of the poses and of the frames' stamps; None: no camera tells it."""
+        offsets = [feed.offset_ns for feed in self._feeds if feed.host_clock]
+        return epoch_ns() - min(offsets) if offsets else None
 
     def mount(self, frame: AnyFrame) -> Transform:
         """Return T_body_sensor (4, 4) of what took a frame of this stream; of a cloud, from its own axes."""

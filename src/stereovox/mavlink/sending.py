@@ -13,6 +13,7 @@ import numpy as np
 from stereovox.errors import StereovoxError
 from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Cloud, UpdateReport
 from stereovox.mapper import Mapper
+from stereovox.mavlink.body import Body, BodyPose
 from stereovox.mavlink.directions import DirectionRules, nearest_places
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
@@ -25,24 +26,32 @@ T_BODY_LIDAR.setflags(write=False)
 HIGHEST_RATE_HZ = 200.0
 PATIENCE = 0.5
 """Share of a period for which a message waits for the next frame."""
+POSE_SHARE = 0.6
+"""How old the body's pose may be, as a share of what its map may be: the body moves, most of what it sees does not."""
 
 
 class ObstacleSender:
     """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D where that is asked for.
 
     It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own
-    reads the map; each message is for the pose of the last frame that the map took in, and waits up to half a period
-    for the next one. Nothing is sent before the first, and nothing once the camera that is silent longest has been so
-    for `max_age_s`: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as failed.
+    reads the map; each message is for where the body is by its newest pose, of a frame that the map took in (`after`,
+    `at`) or without one (`pose`), carried on to the present by the motion between the last two. It waits up to half a
+    period for the next frame.
 
-    `time_usec` and `time_boot_ms` are when that last frame arrived, by this machine's clock, which the autopilot may
-    ask for (TIMESYNC).
+    Nothing is sent before the first frame, nor once any camera's newest frame shows what was more than `max_age_s` ago
+    or the newest pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot reports its
+    sensor as failed. Ages are counted from the event, by its stamp (`Mapper.stamp_clock`, which becomes "live" unless
+    it was set), and at least from its arrival. After the body's pose has jumped nothing is sent until the map took in a
+    frame from there.
+
+    `time_usec` and `time_boot_ms` are when the oldest of the cameras' newest frames was taken, by this machine's clock,
+    which the autopilot may ask for (TIMESYNC).
 
     Args:
         mapper: The mapper whose map is sent.
         connection: A `MavlinkLink`, or the address of one, which is then closed with the sender.
-        rate_hz: Messages a second. PX4 was tested with 10.
-        max_age_s: Seconds since the last frame after which nothing is sent.
+        rate_hz: Messages a second. PX4 was tested with 10. None: there is no thread, and nothing is sent but by `send`.
+        max_age_s: Seconds since what the newest frame shows after which nothing is sent.
         rules: What OBSTACLE_DISTANCE says; by default `SectorRules()`.
         directions: What OBSTACLE_DISTANCE_3D says; None: it is not sent.
         mounts: T_body_sensor (4, 4) by the name of the sensor: maps a camera's optical frame into the body in optical
@@ -63,28 +72,31 @@ class ObstacleSender:
         mapper: Mapper,
         connection: str | MavlinkLink,
         *,
-        rate_hz: float = 10.0,
+        rate_hz: float | None = 10.0,
         max_age_s: float = 0.5,
         rules: SectorRules | None = None,
         directions: DirectionRules | None = None,
         mounts: Mapping[str, Transform] | None = None,
         tell: Tell = warn,
     ):
-        if not 0.1 <= rate_hz <= HIGHEST_RATE_HZ:
+        if rate_hz is not None and not 0.1 <= rate_hz <= HIGHEST_RATE_HZ:
             raise StereovoxError(f"rate_hz {rate_hz:g}: give 0.1 to {HIGHEST_RATE_HZ:g} messages a second")
         if not 0 < max_age_s <= 60:
             raise StereovoxError(f"max_age_s {max_age_s:g}: give seconds above 0, at most 60")
         self._mapper, self._rules, self._directions = mapper, rules or SectorRules(), directions
         self._mounts = _checked_mounts(mounts or {})
-        self._period_s, self._max_age_s, self._tell = 1 / rate_hz, max_age_s, tell
+        self._period_s, self._max_age_s, self._tell = 1 / (rate_hz or HIGHEST_RATE_HZ), max_age_s, tell
         self._own = isinstance(connection, str)
         self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
+        if mapper.stamp_clock is None:
+            mapper.stamp_clock = "live"
         self.sent = 0
-        self._T_world_body: Transform | None = None
+        self._body = Body()
         self._waited_s: dict[str, float] = {}
         self._why, self._new, self._stopped = "", threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="stereovox-obstacles", daemon=True)
-        self._thread.start()
+        if rate_hz is not None:
+            self._thread.start()
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
         """Take the pose of a frame that the map took in.
@@ -97,19 +109,34 @@ class ObstacleSender:
             return
         mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Cloud) else None)
         T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
-        self.at(T_world_sensor if mount is None else T_world_sensor @ inverse(mount), frame.sensor)
+        T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
+        self.at(T_world_body, frame.sensor, stamp_ns=frame.stamp_ns or None)
 
-    def at(self, T_world_body: Transform, sensor: str, waited_s: float = 0.0) -> None:
+    def at(self, T_world_body: Transform, sensor: str, waited_s: float = 0.0, stamp_ns: int | None = None) -> None:
         """Take the pose of the body by a frame that the map took in; `after` does, by the mounts.
 
         Args:
             T_world_body: (4, 4) maps the body (optical axes) into the world.
             sensor: Name of what took the frame.
             waited_s: Seconds from when it arrived until the map took it in; it is as much older.
+            stamp_ns: The frame's; None: that of the last frame that the map took in.
         """
         self._waited_s[sensor] = waited_s
-        self._T_world_body = T_world_body
+        taken_ns = self._mapper.health().stamp_ns if stamp_ns is None else stamp_ns
+        self._body.take(BodyPose(taken_ns or 0, self._mapper.now_ns(), T_world_body))
         self._new.set()
+
+    def pose(self, stamp_ns: int, T_world_body: Transform) -> None:
+        """Take a pose of the body that came now, without a frame.
+
+        Args:
+            stamp_ns: Its time, by the clock of the frames' stamps.
+            T_world_body: (4, 4) maps the body (optical axes) into the world. One that is not finite or no rigid motion
+                says that nobody knows where the body is, and is left out.
+        """
+        self._mapper.heard(stamp_ns)
+        if np.isfinite(T_world_body).all() and rigidity_error(T_world_body) < 1e-3:
+            self._body.take(BodyPose(int(stamp_ns), self._mapper.now_ns(), T_world_body))
 
     def finish(self) -> None:
         """Do nothing: what is sent ends when it is stale, or with `close`."""
@@ -118,7 +145,8 @@ class ObstacleSender:
         """Stop sending, and close the connection unless it was given."""
         self._stopped.set()
         self._new.set()
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
         if self._own:
             self.link.close()
 
@@ -137,10 +165,15 @@ class ObstacleSender:
             self._new.wait(PATIENCE * self._period_s)
             if self._stopped.is_set():
                 return
-            self._send_or_tell()
+            self.send()
             due = max(due + self._period_s, monotonic() - self._period_s)
 
-    def _send_or_tell(self) -> None:
+    def send(self) -> str:
+        """Send what the map says now, and tell the user when that begins or ends to fail; the thread calls it.
+
+        Returns:
+            Why nothing was sent; "": it was, or nothing has come yet.
+        """
         try:
             why = self._send()
         except Exception as error:  # whatever is wrong, nothing is sent, the user is told, and the next try may succeed
@@ -148,16 +181,24 @@ class ObstacleSender:
         if bool(why) != bool(self._why):
             self._tell(f"no obstacle distances are sent: {why}" if why else "obstacle distances are sent again")
         self._why = why
+        return why
 
     def _send(self) -> str:
         """Send what the map says now; return why not, nothing where it was sent."""
-        taken_s, T_world_body = self._mapper.health().ages_s, self._T_world_body
-        if T_world_body is None or not taken_s:
+        health, newest = self._mapper.health(), self._body.newest
+        if newest is None or not health.ages_s:
             return ""  # nothing has come yet, which is no news
-        ages_s = {sensor: age_s + self._waited_s.get(sensor, 0.0) for sensor, age_s in taken_s.items()}
+        ages_s = {sensor: age_s + self._waited_s.get(sensor, 0.0) for sensor, age_s in health.ages_s.items()}
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
         if age_s > self._max_age_s:
             return f"the last trusted frame{f' of {sensor}' if sensor else ''} is {age_s:.2f} s old"
+        pose_age_ns = self._mapper.age_ns(newest.stamp_ns, newest.came_ns)
+        if pose_age_ns > 1e9 * POSE_SHARE * self._max_age_s:
+            return f"the body's newest pose is {pose_age_ns / 1e9:.2f} s old; give newer ones (ObstacleSender.pose)"
+        if self._body.jumped_ns is not None and (health.stamp_ns or 0) < self._body.jumped_ns:
+            return "the body's pose has jumped, and no frame from there is in the map yet"
+        T_world_body = self._body.after(pose_age_ns)
+        assert T_world_body is not None
         seen_ns = max(self.link.now_ns() - round(1e9 * age_s), 0)
         sectors, places = self._sectors(T_world_body, seen_ns), self._places(T_world_body, seen_ns)
         if not self.link.send(sectors):
@@ -165,6 +206,12 @@ class ObstacleSender:
         self.sent += 1
         taken = [self.link.send(message) for message in places]
         return "" if all(taken) else f"{self.link.url} does not take all directions"
+
+    @property
+    def _T_world_body(self) -> Transform | None:  # noqa: N802 - T_a_b is what poses are called
+        """The newest pose of the body."""
+        newest = self._body.newest
+        return None if newest is None else newest.T_world_body
 
     def _sectors(self, T_world_body: Transform, seen_ns: int) -> Any:
         m, rules = self.link.messages, self._rules

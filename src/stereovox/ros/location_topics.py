@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.ros.localization import LocalizedPoses, Localizer, Located, MapLocalization
-from stereovox.ros.motion import TransformPublisher
+from stereovox.ros.motion import Late, TransformPublisher, never_late
 from stereovox.ros.options import Options
 from stereovox.ros.outputs import header, latched_qos
 from stereovox.sources.bags.robot_messages import frame_name
@@ -64,12 +64,14 @@ class LocationTopics:
     """Publishes where the robot is, and takes in where others say it is.
 
     `/tf`: map -> odom, with each scan, dated `ros.tf_tolerance_s` ahead, as Nav2's AMCL does: who asks for the newest
-    pose then need not extrapolate. Nothing while the place is not known, or another node publishes the same.
+    pose then need not extrapolate. Nothing while the place is not known, or another node publishes the same; and no
+    topic has what is old. late: returns why what has a stamp is too old, "" where it is not.
     """
 
-    def __init__(self, node: Any, poses: LocalizedPoses, options: Options):
+    def __init__(self, node: Any, poses: LocalizedPoses, options: Options, late: Late = never_late):
         from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 
+        self._late = late
         self._node, self._poses, self._ahead_ns = node, poses, round(1e9 * options.tf_tolerance_s)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, POSE, latched_qos())
         self._particles = node.create_publisher(PoseArray, PARTICLES, 1)
@@ -80,6 +82,9 @@ class LocationTopics:
     def publish(self, found: Located) -> None:
         """Publish where the robot is after a scan."""
         world = self._poses.world
+        if old := self._late(found.stamp_ns):
+            self._node.get_logger().error(f"{POSE}: not published, {old}", throttle_duration_sec=10.0)
+            return
         if found.moved and found.covariance is not None:
             self._pose.publish(pose_message(found, world))
         if found.moved and self._particles.get_subscription_count():

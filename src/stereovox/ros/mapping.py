@@ -24,6 +24,7 @@ from stereovox.ros.background import Background
 from stereovox.se3 import Transform
 from stereovox.trust.health import Health
 from stereovox.trust.history import History
+from stereovox.trust.stamp_clock import StampsBy
 
 PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]
 """Returns new poses of kept frames (4, 4), by sensor and stamp."""
@@ -44,6 +45,7 @@ class Mapping:
 
     def __init__(self, config: Config, heights: Heights | None = None, tiles: Path | None = None):
         self._heights, self._tiles = heights, tiles
+        self._stamp_clock: StampsBy = None
         self.corrections: Background[CorrectionReport] = Background("stereovox-corrections")
         self._begin(config)
 
@@ -56,6 +58,10 @@ class Mapping:
     def history(self) -> History:
         """History of the map's frames."""
         return self.mapper.map.history
+
+    def stamps_by(self, clock: StampsBy) -> None:
+        """Say by which clock frames are stamped, as `Mapper.stamp_clock`; of later mappers, too."""
+        self._stamp_clock = self.mapper.stamp_clock = clock
 
     def add(self, frame: Frame | Cloud | Scan) -> UpdateReport:
         """Add a frame or scan to the map."""
@@ -122,11 +128,11 @@ class Mapping:
         (self._begin_floor if config.dimensions == 2 else self._begin_space)(config)
 
     def _begin_space(self, config: Config, saved: VoxelMap | None = None) -> None:
-        mapper = Mapper(config, resume=saved, tiles=self._tiles)
+        mapper = Mapper(config, resume=saved, tiles=self._tiles, stamp_clock=self._stamp_clock)
         self.mapper, self._above = mapper, LiveProjection(mapper.map, self._heights).grid
 
     def _begin_floor(self, config: Config, saved: OccupancyGrid | None = None) -> None:
-        mapper = GridMapper(config, resume=saved)
+        mapper = GridMapper(config, resume=saved, stamp_clock=self._stamp_clock)
         self.mapper, self._above = mapper, lambda: _unless_empty(mapper.occupancy())
 
 

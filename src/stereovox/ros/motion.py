@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,14 @@ ODOMETRY = "tracked_odometry"
 """Topic of the odometry."""
 ROS_ORDER = np.r_[3:6, 0:3]
 """Rows of our covariances in the order of `geometry_msgs/PoseWithCovariance`: x, y, z, rotation about X, Y, Z."""
+Late = Callable[[int], str]
 UNKNOWN = 1e9
 """Variance of what is not known: the speed."""
+
+
+def never_late(stamp_ns: int) -> str:
+    """Return that nothing is known of how old a stamp is."""
+    return ""
 
 
 def odometry_message(moved: Moved) -> Any:
@@ -53,12 +60,15 @@ class TransformPublisher:
 
 
 class MotionPublisher:
-    """Publishes tracked poses. node: rclpy's; with_tf: on /tf, too, unless another node does."""
+    """Publishes tracked poses, none that are old. node: rclpy's; with_tf: on /tf, too, unless another node does.
 
-    def __init__(self, node: Any, with_tf: bool):
+    late: returns why what has a stamp is too old, "" where it is not.
+    """
+
+    def __init__(self, node: Any, with_tf: bool, late: Late = never_late):
         from nav_msgs.msg import Odometry
 
-        self._node = node
+        self._node, self._late = node, late
         self._odometry = node.create_publisher(Odometry, ODOMETRY, 10)
         self._tf = TransformPublisher(node) if with_tf else None
         if self._tf is not None and not self._tf.works:
@@ -66,6 +76,9 @@ class MotionPublisher:
 
     def publish(self, moved: Moved) -> None:
         """Publish a pose."""
+        if old := self._late(moved.stamp_ns):
+            self._node.get_logger().error(f"{ODOMETRY}: not published, {old}", throttle_duration_sec=10.0)
+            return
         self._odometry.publish(odometry_message(moved))
         if self._tf is None:
             return

@@ -26,6 +26,7 @@ from stereovox.ros.pose_source import pose_source
 from stereovox.ros.poses import fixed_transform
 from stereovox.ros.score import score_of
 from stereovox.ros.services import Services
+from stereovox.ros.stamps import StampsByNode
 from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.se3 import inverse
 from stereovox.sources.waiting import Arrival, Waiting
@@ -61,7 +62,9 @@ class MapNode:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(getattr(node, "itself", node))
         self.active = True
-        self._source = pose_source(node, mapping.config, options)
+        self._stamps = StampsByNode(node, mapping.config.trust.stale_s)
+        mapping.stamps_by(self._stamps.now_ns)
+        self._source = pose_source(node, mapping.config, options, self._stamps.late)
         self._poses = self._source.poses
         for text in options.fixed:
             parent, child, numbers = fixed_transform(text)
@@ -141,6 +144,7 @@ class MapNode:
         self.received[topic] += 1
         try:
             stamp_ns, frame_id = header(data)
+            self._stamps.heard(stamp_ns)
         except ValueError:  # no pose to wait for: it is refused in its turn
             stamp_ns, frame_id = 0, ""
         self.waiting.put(topic, stamp_ns, frame_id, data)

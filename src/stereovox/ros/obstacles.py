@@ -84,8 +84,8 @@ class Obstacles:
     """Publishes both clouds while frames come that can be trusted; with the stamp of the newest one.
 
     Without such frames nothing is published, so that who needs to know that the map is current can tell by the stamps;
-    neither while one of several sensors has been without one for `trust.stale_s`, since what it looks at may be free no
-    longer. clock: monotonic seconds.
+    neither while what any sensor's newest frame shows is older than `trust.stale_s`, since what it looks at may be free
+    no longer. clock: monotonic seconds.
     """
 
     def __init__(self, node: Any, mapping: Mapping, options: Options, clock: Callable[[], float] = monotonic):
@@ -108,7 +108,7 @@ class Obstacles:
             return
         if not any(one.get_subscription_count() for one in self._publishers):
             return
-        if silent := self._silent():
+        if silent := self._stale():
             self._node.get_logger().error(f"no obstacles: {silent}", throttle_duration_sec=10.0)
             return
         self._next = now + 1 / self._options.obstacle_rate
@@ -126,9 +126,9 @@ class Obstacles:
             lifted = np.column_stack([points, np.full(len(points), self._height)])
             publisher.publish(points_message(lifted, stamp_ns, world))
 
-    def _silent(self) -> str:
-        """Return which of several sensors has been without a trusted frame for too long, if any."""
+    def _stale(self) -> str:
+        """Return which sensor's newest trusted frame is too old, if any."""
         ages_s, most_s = self._mapping.health().ages_s, self._mapping.config.trust.stale_s
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1], default=("", 0.0))
-        silent = len(ages_s) > 1 and age_s > most_s
-        return f"the last trusted frame of {sensor} is {age_s:.2f} s old (trust.stale_s {most_s:g})" if silent else ""
+        stale = age_s > most_s
+        return f"the last trusted frame of {sensor} is {age_s:.2f} s old (trust.stale_s {most_s:g})" if stale else ""

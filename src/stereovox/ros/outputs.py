@@ -21,7 +21,7 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.library import optional_message
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
-from stereovox.trust.health import Health
+from stereovox.trust.health import STALE, Health
 
 FLOAT32 = 7
 """`sensor_msgs/PointField` type."""
@@ -120,7 +120,11 @@ def _format_value(value: object) -> str:
 
 
 class Outputs:
-    """Publishes a map. counts: returns the values of diagnostics besides health. clock: monotonic seconds."""
+    """Publishes a map once frames have changed it, while it is not stale or lost, once it was corrected, and at the end.
+
+    Each message has the stamp of the map's newest frame; diagnostics always say how old that is.
+
+    counts: returns the values of diagnostics besides health. clock: monotonic seconds."""
 
     def __init__(
         self,
@@ -134,7 +138,7 @@ class Outputs:
         self._counts, self._clock = counts, clock
         self._publishers = _Publishers(node, mapping.config.dimensions, options)
         self._stamp_ns, self._frame_id = 0, ""
-        self._new_map = self._new_cloud = False
+        self._new_map = self._new_cloud = self._corrected = False
         self._next_map = self._next_cloud = self._next_diagnostics = 0.0
         self._worker = ThreadPoolExecutor(1, "stereovox-messages")
         self._busy: Future[None] | None = None
@@ -146,15 +150,18 @@ class Outputs:
 
     def corrected(self) -> None:
         """Mark the map as changed by other means than a frame; its newest frame is the same."""
-        self._new_map = self._new_cloud = True
+        self._new_map = self._new_cloud = self._corrected = True
 
     def update(self) -> None:
         """Publish what is due."""
         now = self._clock()
-        if self._new_map and now >= self._next_map:
-            self._publish_map(now)
-        if self._new_cloud and now >= self._next_cloud and self._publishers.has_subscribers() and self._idle():
-            self._publish_cells(now)
+        new_map = self._new_map and now >= self._next_map
+        new_cloud = self._new_cloud and now >= self._next_cloud and self._publishers.has_subscribers() and self._idle()
+        if (new_map or new_cloud) and (self._corrected or self._current()):
+            if new_map:
+                self._publish_map(now)
+            if new_cloud:
+                self._publish_cells(now)
         if now >= self._next_diagnostics:
             self._next_diagnostics = now + DIAGNOSED_S
             stamp_ns = self._node.get_clock().now().nanoseconds
@@ -167,8 +174,16 @@ class Outputs:
             self._publish_map(self._clock())
         self._worker.shutdown()
 
+    def _current(self) -> bool:
+        """Return whether the map is fresh enough to be published, else log why not."""
+        health = self._mapping.health()
+        if health.state in STALE:
+            text = f"the map is not published, it is {health.text}"
+            self._node.get_logger().error(text, throttle_duration_sec=10.0)
+        return health.state not in STALE
+
     def _publish_map(self, now: float) -> None:
-        self._new_map = False
+        self._new_map = self._corrected = False
         heard = self._publishers.map.get_subscription_count() > 0
         period = 1 / self._options.map_rate if heard else UNHEARD_S
         self._next_map = max(self._next_map, now - period) + period  # one frame may come early: camera rates vary

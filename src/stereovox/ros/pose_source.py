@@ -24,7 +24,7 @@ from stereovox.ros.localization import (
 )
 from stereovox.ros.location_topics import InitialPose, LocationTopics
 from stereovox.ros.map_server import MapServer
-from stereovox.ros.motion import MotionPublisher
+from stereovox.ros.motion import Late, MotionPublisher, never_late
 from stereovox.ros.options import SLAM, Options, split_pair
 from stereovox.ros.poses import PoseBuffer
 from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses, Tracking
@@ -76,11 +76,11 @@ class CameraPoses(PoseSource):
 
     continuable = False
 
-    def __init__(self, node: Any, config: Config, options: Options):
+    def __init__(self, node: Any, config: Config, options: Options, late: Late):
         names = options.world_frame, options.base_frame, options.extrapolate_s
         poses = TrackedPoses(*names, base_needed=config.dimensions == 2)
         self.poses = poses
-        self._tracking = Tracking(config, poses, MotionPublisher(node, options.publish_tf).publish)
+        self._tracking = Tracking(config, poses, MotionPublisher(node, options.publish_tf, late).publish)
 
     def inputs(self, options: Options, dimensions: int) -> list[Input]:
         """Return the topics to listen to; the first depth camera is tracked."""
@@ -95,10 +95,10 @@ class CameraPoses(PoseSource):
 class LidarPoses(PoseSource):
     """Poses by localisation. The map that the robot is localised in is on `/map`."""
 
-    def __init__(self, node: Any, config: Config, options: Options):
+    def __init__(self, node: Any, config: Config, options: Options, late: Late):
         self.poses = LocalizedPoses(options.world_frame, options.base_frame, options.extrapolate_s, options.odom_frame)
         self._log, self._server = node.get_logger(), MapServer(node, self.poses.world)
-        self._topics = LocationTopics(node, self.poses, options)
+        self._topics = LocationTopics(node, self.poses, options, late)
         self._slam: SlamLocalization | None = None
         localization = self._slamming(config) if options.poses == SLAM else self._localising(node, config, options)
         self._localizer = Localizer(localization, self.poses, self._told, self._log.warning)
@@ -162,11 +162,14 @@ class LidarPoses(PoseSource):
         self._new, self._stamp_ns = self._new or found.moved, found.stamp_ns
 
 
-def pose_source(node: Any, config: Config, options: Options) -> PoseSource:
-    """Return where poses come from. Raises StereovoxError, one line, for a bad map or start, MissingExtra for gtsam."""
+def pose_source(node: Any, config: Config, options: Options, late: Late = never_late) -> PoseSource:
+    """Return where poses come from. late: returns why what has a stamp is too old to be published, "" where it is not.
+
+    Raises StereovoxError, one line, for a bad map or start, MissingExtra for gtsam.
+    """
     if options.poses == GIVEN:
         return GivenPoses(options)
-    return (CameraPoses if options.poses == TRACK else LidarPoses)(node, config, options)
+    return (CameraPoses if options.poses == TRACK else LidarPoses)(node, config, options, late)
 
 
 def inputs_of(options: Options, dimensions: int) -> list[Input]:

@@ -174,6 +174,12 @@ class LivePoses:
         with self._change:
             return self._stamps[-1] if self._stamps else None
 
+    @property
+    def newest(self) -> tuple[int, Transform] | None:
+        """Stamp and T_world_body (4, 4) of the newest pose, NaN where it cannot be used; None without any."""
+        with self._change:
+            return (self._stamps[-1], self._poses[self._stamps[-1]]) if self._stamps else None
+
     def __len__(self) -> int:
         return len(self._stamps)
 

@@ -13,12 +13,15 @@ from stereovox.frame import AnyFrame, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
+from stereovox.trust.health import STALE
 from stereovox.trust.history import History
 from stereovox.viewer.frame import FramePanel, describe_frame
 from stereovox.viewer.panel import plain
 from stereovox.viewer.serve import HERE, PORT
 from stereovox.viewer.viewer import open_viewer
 
+HEALTH_S = 0.5
+"""Seconds between two updates of the map's health, also while no frame comes."""
 MIN_S = 0.5
 """Minimum seconds between two updates."""
 COPY_REST, DRAW_REST = 25, 4
@@ -53,6 +56,7 @@ class LiveView:
         self.viewer = open_viewer(_copy(mapper), name, host, port, token=token)
         gui = self.viewer.server.gui
         with gui.add_folder("Now", order=0.5):
+            self.health = gui.add_markdown("")
             self.frame = FramePanel(self.viewer.server, mapper.config)
         self._arrivals: deque[float] = deque(maxlen=200)
         self._due = 0.0
@@ -129,7 +133,8 @@ class LiveView:
     def _run(self) -> None:
         """Draw each copy, then leave the processor to mapping for a while."""
         while True:
-            self._ask.wait()
+            while not self._ask.wait(HEALTH_S):
+                self._show_health()
             self._ask.clear()
             if self._stopped.is_set() or self._waiting is None:
                 return
@@ -138,23 +143,31 @@ class LiveView:
                 self._draw(*self._waiting)
             except Exception as error:  # a failed drawing must stop neither the next one nor mapping
                 warnings.warn(f"the live view could not be drawn ({type(error).__name__}: {error})", stacklevel=1)
-            self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
+            end = monotonic() + min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2)
+            while (left := end - monotonic()) > 0 and not self._stopped.wait(min(left, HEALTH_S)):
+                self._show_health()
             self._free.set()
 
     def _draw(self, voxel_map: VoxelMap, frame: AnyFrame, text: str) -> None:
+        self._show_health()
         self.frame.show(frame, text)
         self.viewer.update(voxel_map)
         self.viewer.follow()
 
+    def _show_health(self) -> None:
+        """Say how old the map is, in bold where it is too old to be acted on."""
+        health = self._mapper.health()
+        text = plain(health.text)
+        self.health.content = f"**{text}**" if health.state in STALE else text
+
     def _progress(self, history: History) -> str:
         """Describe the progress of mapping as Markdown."""
-        times, health = self._arrivals, self._mapper.health()
+        times = self._arrivals
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         rows = [
             ("frames a second", f"{rate:.1f}"),
             ("frames in the map", f"{history.frames:,}"),
             ("refused", ", ".join(f"{n:,} {plain(why)}" for why, n in history.refused.most_common(5)) or "none"),
-            ("health", plain(health.text)),
         ]
         return "\n".join(["| now | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows)])
 

@@ -87,14 +87,20 @@ def _grid_of(
     return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body
 
 
-def together(last: Mapping[str, tuple[SphereGrid, Transform]]) -> tuple[SphereGrid, int]:
+def together(
+    last: Mapping[str, tuple[SphereGrid, Transform]], now: tuple[int, Transform] | None = None
+) -> tuple[SphereGrid, int]:
     """Return the grid of all cameras' last ones, seen from where the body was at the newest, and its time in ns.
 
-    last: by camera, at least one: its grid, and T_world_body (4, 4) when it was taken.
+    last: by camera, at least one: its grid, and T_world_body (4, 4) when it was taken. now: a later time in ns and
+    T_world_body then, from where it is seen in place of the newest.
     """
     newest, T_world_now = max(last.values(), key=lambda item: _stamp(item[0]))
+    at_ns = _stamp(newest)
+    if now is not None and now[0] > at_ns:
+        at_ns, T_world_now = now
     grids = [_carried(grid, inverse(T_world_now) @ T_world_then) for grid, T_world_then in last.values()]
-    return stitch(grids or [empty(newest.layout)]), _stamp(newest)
+    return stitch(grids or [empty(newest.layout)]), at_ns
 
 
 def _carried(grid: SphereGrid, T_now_then: Transform) -> SphereGrid:

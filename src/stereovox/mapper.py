@@ -43,11 +43,17 @@ class AnyMapper(Protocol[SeenT]):
 
     Attributes:
         config: The settings.
-        stamp_clock: By which clock frames are stamped.
     """
 
     config: Config
-    stamp_clock: StampsBy
+
+    @property
+    def stamp_clock(self) -> StampsBy:
+        """By which clock frames are stamped; it may be set at any time."""
+        ...
+
+    @stamp_clock.setter
+    def stamp_clock(self, clock: StampsBy) -> None: ...
 
     @property
     def map(self) -> VoxelMap | GridMap:

@@ -56,7 +56,7 @@ class StampClock:
     def by(self, clock: StampsBy) -> None:
         if not (clock is None or callable(clock) or clock in ("live", "replay")):
             raise ConfigError(f"stamp_clock {clock!r}: give 'live', 'replay' or a function that returns nanoseconds")
-        self._by = clock
+        self._by: StampsBy = clock
 
     def heard(self, source: str, stamp_ns: int, now_ns: int) -> None:
         """Take note that something with a stamp came from a source (a sensor, the poses) at `now_ns`."""

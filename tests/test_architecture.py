@@ -226,7 +226,7 @@ def test_bare_files_are_found(tmp_path):
 
 def test_nothing_goes_by_a_clock_that_is_set():
     """Checkpoints, ages and deadlines would come early, late or never when somebody sets the system's time."""
-    measured = SOURCE / "sources/wall_clock.py"  # ages of images by their own stamps
+    measured = SOURCE / "trust/wall_clock.py"  # ages of images by their own stamps
     for path in sorted({*SOURCE.rglob("*.py")} - {measured}):
         names = {name for _, name in imported(ast.parse(path.read_text()), [])}
         assert not names & {"time", "time.time", "time.time_ns", "datetime", "datetime.datetime"}, path

@@ -16,6 +16,7 @@ from stereovox.threads import MapLock
 from stereovox.trust.gate import Gate, Passed
 from stereovox.trust.health import FULL, Health, HealthMonitor
 from stereovox.trust.stamp_clock import StampsBy
+from stereovox.trust.wall_clock import epoch_ns
 
 
 class Intake:
@@ -34,10 +35,9 @@ class Intake:
         target: VoxelMap | GridMap,
         clock: Callable[[], int],
         stamps_by: StampsBy,
-        epoch: Callable[[], int],
     ):
         self.gate = Gate(config, target.history)
-        self.monitor = HealthMonitor(config, clock, stamps_by, epoch)
+        self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
         self._map, self._adding = target, MapLock()
 
     def offer(self, frame: AnyFrame | Scan) -> Offer:

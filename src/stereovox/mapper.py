@@ -28,7 +28,6 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.rebuild import CorrectionReport, FramePoses, correct
-from stereovox.sources.wall_clock import epoch_ns
 from stereovox.threads import MapLock, uninterrupted
 from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
@@ -139,7 +138,7 @@ class Mapper(Aged):
         self._deadline = Deadline(self.config)
         self._levels, self._tiles, self._correcting = Levels(self.config), tiles, MapLock()
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
-        self._intake = Intake(self.config, self.map, clock, stamp_clock, epoch_ns)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = Comparison(self.config, self._intake.gate)
 
     def add(self, frame: AnyFrame) -> UpdateReport:
@@ -290,7 +289,7 @@ class GridMapper(Aged):
         self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)
-        self._intake = Intake(self.config, self.map, clock, stamp_clock, epoch_ns)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock)
 
     def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.

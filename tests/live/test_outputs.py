@@ -23,7 +23,7 @@ from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
 from stereovox.sources.bags.writer import BagWriter
-from stereovox.sources.wall_clock import epoch_ns
+from stereovox.trust.wall_clock import epoch_ns
 
 MS = 1_000_000
 SETTINGS = {"voxel_size": 0.1, "max_range": 4.0}

@@ -11,7 +11,7 @@ from typing import Any
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import UpdateReport
 from stereovox.live.stream import Moment
-from stereovox.sources.wall_clock import epoch_ns
+from stereovox.trust.wall_clock import epoch_ns
 
 STAMP, ARRIVAL = "stamp", "arrival"
 

@@ -33,10 +33,10 @@ from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.paced import Paced
 from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.sources.waiting import Arrival, Waiting
-from stereovox.sources.wall_clock import epoch_ns
 from stereovox.survey import level_pose
 from stereovox.track.stream import follow
 from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
+from stereovox.trust.wall_clock import epoch_ns
 
 WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 2
 """Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer

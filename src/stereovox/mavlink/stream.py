@@ -10,7 +10,7 @@ from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.poses import PoseReceiver
 from stereovox.se3 import Transform
 from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
-from stereovox.sources.wall_clock import epoch_ns
+from stereovox.trust.wall_clock import epoch_ns
 
 PREFIX = "mavlink:"
 

@@ -120,7 +120,7 @@ def _format_value(value: object) -> str:
 
 
 class Outputs:
-    """Publishes a map once frames have changed it, while it is not stale or lost, once it was corrected, and at the end.
+    """Publishes a map that frames have changed while it is not stale or lost, and once it was corrected, or at the end.
 
     Each message has the stamp of the map's newest frame; diagnostics always say how old that is.
 

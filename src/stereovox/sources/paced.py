@@ -10,7 +10,7 @@ from time import monotonic_ns
 
 from stereovox.frame import AnyFrame
 from stereovox.sources.base import Stream
-from stereovox.sources.wall_clock import epoch_ns
+from stereovox.trust.wall_clock import epoch_ns
 
 
 class Paced(Stream):

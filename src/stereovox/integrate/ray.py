@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from math import ceil
@@ -30,7 +31,7 @@ from stereovox.integrate.views import (
     sensor_table,
     uses_wide_keys,
 )
-from stereovox.maps.blocks import CELLS, BlockPool
+from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
@@ -40,8 +41,20 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 Keys = NDArray[np.signedinteger]
 
+MOST_LARGER = 64
+OBLIQUE = 1.5
+"""Cells that a ray crosses for each cell's length of depth: the average over all directions."""
 MAX_CELL_PX = 512
 """Most pixels along a cell at a depth of one metre; with more, `_lanes` rounds the weight of one to nothing."""
+
+
+STEPS_PER_MS, BLOCKS_PER_MS = 200_000, 100
+"""Cells that rays cross in a millisecond at least, and blocks of cells that are new to the frame."""
+OVERRUN = 4
+"""By how many times a frame may take longer than `deadline_ms`: with more work than that its pixels are made larger.
+Below, the deadline's own levels see to it."""
+STEPS_AT_ONCE, SLOW_STEPS = 20_000_000, 50_000_000
+"""Cells after which Ctrl-C is heard, and from which on a frame is so slow, half a second, that the user is told."""
 
 
 class Ray:
@@ -59,16 +72,18 @@ class Ray:
         self._config = config
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
         self._eyes = PerCamera(partial(_eye, sensor, config))
+        self._told = False
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return the evidence of `image` on the cells its rays cross."""
-        config, image = self._config, self._of_countable_rays(image)
+        config, image = self._config, self._in_time(self._of_countable_rays(image))
         camera = image.camera
         eye, view = self._eyes[camera], rays_of(image, config)
         weight = np.float32(self._cell_px(camera) ** -2) if config.ray.update == "every" else None
         workers = len(shards(camera.height, config.threads))
         parts = [slice(n, camera.height, workers) for n in range(workers)]  # as many long rays for each
-        in_shards(lambda part: self._follow(image, view, weight, eye, part), parts)
+        chunks = int(self._steps(image) / workers / STEPS_AT_ONCE) + 1
+        in_shards(lambda part: self._follow(image, view, weight, eye, part, chunks), parts)
         pool = merged(self._pools[:workers], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
@@ -92,17 +107,73 @@ class Ray:
             f"{MAX_CELL_PX}; use integrator projective or ray.update once",
         )
 
-    def _follow(self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, part: slice) -> None:
-        """Follow the rays of some rows; the first of them tells which thread's memory to use."""
+    def _steps(self, image: DepthImage) -> float:
+        """Return about how many cells the rays of an image cross."""
+        ends = np.minimum(image.depth_m, np.float32(self._config.max_range))  # NaN, without a ray, is left out
+        metres = float(np.nansum(ends, dtype=np.float64))
+        return OBLIQUE * metres / self._config.voxel_size
+
+    def _in_time(self, image: DepthImage) -> DepthImage:
+        """Return the image, or its block minima where its rays would cross too many cells for the deadline.
+
+        Raises FrameRefused `no_time` for a camera whose pixels cannot be put together.
+        """
+        steps = self._steps(image)
+        if steps > SLOW_STEPS and not self._told:
+            self._told = True
+            line = (
+                f"integrator {self._config.integrator} follows rays through {steps / 1e6:,.0f} million cells of "
+                f"{self._config.voxel_size:g} m for one image, which is far from real time; "
+                "use integrator projective, larger cells (voxel_size) or a shorter max_range"
+            )
+            warnings.warn(line, RuntimeWarning, stacklevel=2)
+        deadline_ms = self._config.deadline_ms
+        larger = 1 if deadline_ms is None else self._larger(image, steps, OVERRUN * deadline_ms)
+        if larger == 1:
+            return image
+        if isinstance(image.camera, PinholeCamera):
+            return downsample(image, min(larger, *image.depth_m.shape))
+        cure = "use integrator projective, larger cells or a shorter max_range"
+        raise FrameRefused("no_time", f"its rays cross {steps / 1e6:,.0f} million cells; {cure}")
+
+    def _larger(self, image: DepthImage, steps: float, most_ms: float) -> int:
+        """Return by how much larger pixels must be for a frame of so many steps to take no longer than that."""
+        ends = np.minimum(image.depth_m, np.float32(self._config.max_range))
+        pixel = (image.camera.binning / image.camera.focal_px) ** 2
+        metres3 = float(np.nansum(ends**3, dtype=np.float64)) / 3 * pixel
+        blocks = 2 * metres3 / (SIDE * self._config.voxel_size) ** 3  # those at its faces are seen in part
+        larger = 1
+        while (
+            steps / larger**2 / STEPS_PER_MS + min(steps / larger**2 / SIDE, blocks) / BLOCKS_PER_MS > most_ms
+            and larger < MOST_LARGER
+        ):
+            larger += 1
+        return larger
+
+    def _follow(
+        self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, part: slice, chunks: int
+    ) -> None:
+        """Follow the rays of some rows; the first of them tells which thread's memory to use.
+
+        chunks: parts between which Ctrl-C is heard.
+        """
         pool = self._pools[part.start]
         pool.clear()
-        while not self._kernel(
-            image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[part.start],
-            pool.table, pool.coords, pool.count, pool.values, part.start, part.stop, part.step,
-        ):  # fmt: skip
+        rows = range(part.start, part.stop, part.step)
+        size = -(-len(rows) // chunks) or 1
+        begin = 0
+        while begin < len(rows):
+            some = rows[begin : begin + size]
+            if self._kernel(
+                image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[part.start],
+                pool.table, pool.coords, pool.count, pool.values, some.start, some.stop, some.step,
+            ):  # fmt: skip
+                begin += size
+                continue
             check_blocks(2 * len(pool.coords), image.camera)
             pool.clear()
             pool.reserve(2 * len(pool.coords))
+            begin = 0
 
 
 class Line(Ray):

@@ -23,12 +23,12 @@ from stereovox.formats.map_server import write_map_server
 from stereovox.frame import Cloud, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products.context import context_of
 from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
 from stereovox.safe_io import FLOOR_ENDINGS, check_file
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.live_poses import LivePoses
-from stereovox.trust.health import STALE
 
 GRID_S = 1.0
 """Seconds between two writes of the 2-D map."""
@@ -108,10 +108,10 @@ class GridFile:
 
     def _current(self) -> bool:
         """Return whether the map is fresh enough to be written, and tell the user once where it is not."""
-        health = self._mapper.health()
-        was, self._stale = self._stale, health.state in STALE
-        if self._stale and not was:
-            self._notify(f"{self._file}: is not written anew, the map is {health.text}")
+        why = context_of(self._mapper).stale
+        was, self._stale = self._stale, bool(why)
+        if why and not was:
+            self._notify(f"{self._file}: is not written anew, the map is {why}")
         return not self._stale
 
     def _write(self) -> None:
@@ -202,8 +202,8 @@ class LiveSphere:
         """
         if not self._last:
             raise StereovoxError("no image has been mapped yet; ask again later")
-        if self._mapper is not None and not self._finished and (health := self._mapper.health()).state in STALE:
-            raise StereovoxError(f"the distances are old, the map is {health.text}; ask again later")
+        if self._mapper is not None and not self._finished and (why := context_of(self._mapper).stale):
+            raise StereovoxError(f"the distances are old, the map is {why}; ask again later")
         now = None if self._poses is None or self._finished else self._poses.newest
         return together(self._last, now if now is not None and np.isfinite(now[1]).all() else None)
 

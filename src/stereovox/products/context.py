@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a map says besides its cells, and what each output does with it: nothing leaves a map without an answer to that.
+
+`OUTPUTS` is the table. Each cell begins with what is done: `uses` it, `refuses` where it is bad, `carries along` what
+says it, or `not meaningful, because` of something. A test walks the table with a bad case for each cell that uses or
+refuses, and fails for an output that is not in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from stereovox.config import Config
+from stereovox.products.floor_axes import up_of
+from stereovox.products.floor_heights import FloorHeights
+from stereovox.trust.health import STALE, Health
+
+
+class HasMap(Protocol):
+    """A mapper, or anything with settings that says how old its map is."""
+
+    config: Config
+
+    def health(self, now_ns: int | None = None) -> Health:
+        """Return how current the map is."""
+        ...
+
+
+@dataclass(frozen=True)
+class MapContext:
+    """What whoever acts on a map must know besides its cells.
+
+    Attributes:
+        world: Name of the frame that coordinates are in.
+        up: Unit vector (3,) that points up in it.
+        tilt_deg: Degrees between `up` and the nearest axis of the map, to which layers and columns are square.
+        floor: Height of the floor at each place, or that it is unknown; None: it was not searched for.
+        stamp_ns: Time of the last event that the map shows, by the clock of its stamps; None: of no known time.
+        age_s: Seconds since that event; None: nobody knows, as of a map that was loaded.
+        health: Of the mapper; None without one.
+        unknown: What an unknown cell means for the output.
+    """
+
+    world: str
+    up: tuple[float, float, float]
+    tilt_deg: float
+    floor: FloorHeights | None = None
+    stamp_ns: int | None = None
+    age_s: float | None = None
+    health: Health | None = None
+    unknown: str = "unknown cells are not free"
+
+    @property
+    def stale(self) -> str:
+        """Why the map is too old to be acted on; "" where it is not, or it is no live map."""
+        return self.health.text if self.health is not None and self.health.state in STALE else ""
+
+
+def context_of(mapper: HasMap, world: str = "map") -> MapContext:
+    """Return the context of a growing map; its floor is not searched for.
+
+    Args:
+        mapper: Its mapper.
+        world: Name of its frame.
+    """
+    config, health = mapper.config, mapper.health()
+    up = tuple(map(float, up_of(config)))
+    return MapContext(
+        world, (up[0], up[1], up[2]), float(np.degrees(config.tilt)), None, health.stamp_ns, health.age_s, health
+    )
+
+
+class Leaves(NamedTuple):
+    """What an output does with each property of a map."""
+
+    frame: str
+    up: str
+    floor: str
+    age: str
+    health: str
+    unknown: str
+
+
+WORLD = "carries along: coordinates in the map's world"
+SPACE = "not meaningful, because coordinates in space need no direction up"
+NO_FLOOR = "not meaningful, because no height is measured from a floor"
+OFFLINE = "not meaningful, because a map alone does not know the present time; Mapper.health does"
+JUDGED = "not meaningful, because a map alone has no mapper; whoever made it asks Mapper.health"
+MAP = "carries along: the map's own stamps and history"
+ALL_CELLS = "carries along: unknown cells stay unknown"
+SOLID = "carries along: only what is surely occupied; what is missing says nothing"
+LEVEL = "refuses: a map whose layers are not level"
+FLOOR_2D = "uses: heights above the floor, as `project` documents"
+SILENT = "refuses: silent while the map is stale or lost"
+EVENT = "carries along: the stamp of the newest frame"
+OLD = "refuses: silent once what was seen is too old, by its stamp"
+SOLIDS = Leaves(WORLD, SPACE, NO_FLOOR, OFFLINE, JUDGED, SOLID)
+WHOLE = Leaves(WORLD, "carries along: the setting `up`", NO_FLOOR, MAP, MAP, ALL_CELLS)
+GRID = Leaves("carries along: origin and axes of the grid", LEVEL, FLOOR_2D, OFFLINE, JUDGED, "uses: -1, never free")
+POSE = Leaves(
+    "carries along: frame names in the header", SPACE, NO_FLOOR, OLD,
+    "not meaningful, because a pose is no statement of the map", "not meaningful, because a pose has no cells",
+)  # fmt: skip
+
+OUTPUTS: dict[str, Leaves] = {
+    "sv.obstacle_sectors": Leaves(
+        "uses: distances from the given pose of the body", LEVEL, NO_FLOOR, OFFLINE, JUDGED, "uses: ends what is free"
+    ),
+    "sv.ObstacleSender": Leaves(
+        "uses: distances from the body's newest pose", LEVEL, NO_FLOOR, OLD, OLD, "uses: ends what is free"
+    ),
+    "sv.check_path": Leaves(WORLD, SPACE, NO_FLOOR, MAP, JUDGED, "refuses: blocks the path"),
+    "sv.frontiers": Leaves(WORLD, "carries along: the setting `up`", FLOOR_2D, OFFLINE, JUDGED, "uses: it is the goal"),
+    "sv.LevelWays": Leaves(WORLD, "carries along: layers of the map", NO_FLOOR, OFFLINE, JUDGED, "refuses: no way"),
+    "sv.DistanceField": Leaves(WORLD, SPACE, NO_FLOOR, OFFLINE, JUDGED, "carries along: as its argument says"),
+    "sv.ground": Leaves(WORLD, LEVEL, "uses: it is what is found", OFFLINE, JUDGED, "carries along: UNKNOWN footing"),
+    "sv.coarsen": WHOLE,
+    "sv.crop": WHOLE,
+    "sv.difference": Leaves(WORLD, SPACE, NO_FLOOR, OFFLINE, JUDGED, "carries along: cells known in both alone"),
+    "sv.surface": SOLIDS,
+    "sv.export": Leaves(
+        WORLD, "carries along: as its format, below", NO_FLOOR, OFFLINE, JUDGED, "carries along: below"
+    ),
+    "sv.describe": WHOLE,
+    "sv.write_nav2": Leaves(
+        *5 * ["not meaningful, because it writes settings alone"], "not meaningful, because no map"
+    ),
+    "sv.loops_picture": Leaves(*6 * ["not meaningful, because it draws poses alone"]),
+    "sv.trajectory_picture": Leaves(*6 * ["not meaningful, because it draws poses alone"]),
+    "sv.open_viewer": Leaves(WORLD, "carries along: up of the page", NO_FLOOR, OFFLINE, JUDGED, SOLID),
+    "sv.LiveView": Leaves(
+        WORLD, "carries along: up of the page", NO_FLOOR, EVENT, "uses: said, also in silence", SOLID
+    ),
+    "live.GridFile": GRID._replace(age="carries along: as health", health=SILENT),
+    "live.LiveSphere": Leaves(
+        "uses: seen from the body's newest pose",
+        "carries along: axes of the body",
+        NO_FLOOR,
+        "carries along: a stamp for each cell",
+        SILENT,
+        "carries along: cells without a range",
+    ),
+    **dict.fromkeys(("format .bt", "format .ot"), WHOLE._replace(age=OFFLINE, health=JUDGED)),
+    **dict.fromkeys([f"format .{name}" for name in ("ply", "pcd", "npz", "glb", "obj", "stl", "rrd")], SOLIDS),
+    **dict.fromkeys([f"format .{name}" for name in ("bag", "mcap", "db3")], GRID),
+    **dict.fromkeys([f"format .{name}" for name in ("pgm", "png", "yaml")], GRID),
+    "topic map_mapping": GRID._replace(age=EVENT, health=SILENT),
+    "topic occupied_cells": SOLIDS._replace(age=EVENT, health=SILENT),
+    **dict.fromkeys(("topic octomap_binary", "topic octomap_full"), WHOLE._replace(age=EVENT, health=SILENT)),
+    **dict.fromkeys(
+        ("topic obstacles", "topic free_rays"),
+        GRID._replace(age=OLD, health=OLD, unknown="uses: marks nothing, and ends what is free"),
+    ),
+    "topic /diagnostics": Leaves(
+        *3 * ["not meaningful, because it has no coordinates"],
+        "uses: as a value",
+        "uses: its level",
+        "not meaningful, because it has no cells",
+    ),
+    **dict.fromkeys(("topic tracked_odometry", "topic /tf", "topic amcl_pose", "topic particlecloud"), POSE),
+    "topic map_error": Leaves(*6 * ["not meaningful, because it compares two maps of one frame"]),
+    "topic map": Leaves(*6 * ["not meaningful, because it is the map that was given, or SLAM's own"]),
+}
+"""What each output does with each property: names of `stereovox` (`sv.`), outputs of live runs, formats, ROS topics."""

@@ -17,7 +17,7 @@ from stereovox.entrance import CLOUD, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, SCAN
 from stereovox.frame import Reason, Scan, StereoFrame
 from stereovox.mapper import GridMapper
 from stereovox.se3 import look_at, rotation_matrix
-from stereovox.trust.history import MOVED, Doubt
+from stereovox.trust.history import Doubt
 
 CAMERA = sv.PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.1)
 WALL_M = 1.0
@@ -268,12 +268,14 @@ def _contradicting(kind: str) -> list[Case]:
     return [Case(bad, before, {"voxel_size": 0.03, "stereo.subpixel": 0.05})]
 
 
-def _knocked(kind: str) -> list[Case]:
+def _doubted(fits: int) -> Callable[[str], list[Case]]:
+    """Return a recipe of a frame that comes after 2 s of others in doubt, of which so many in 60 fit elsewhere."""
+
     def judged(mapper: Any) -> None:
         sensor = next(iter(mapper.map.history.trusted))
-        mapper.map.history.doubts[sensor] = Doubt(11 * 10**8, 12 * 10**8, 6, 6, MOVED)
+        mapper.map.history.doubts[sensor] = Doubt(-8 * 10**8, 11 * 10**8, 60, fits)
 
-    return [replace(case, arrange=judged) for case in _contradicting(kind)]
+    return lambda kind: [replace(case, arrange=judged) for case in _contradicting(kind)]
 
 
 def _no_room(kind: str) -> list[Case]:
@@ -348,7 +350,8 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("camera_vertical", 0): _down,
     ("heights_not_seen", 0): _posed(lambda T: _at(T, 2, 3, 100)),
     ("disagrees_with_map", 0): _contradicting,
-    ("camera_moved", 0): _knocked,
+    ("contradicts_map", 0): _doubted(0),
+    ("camera_moved", 0): _doubted(60),
     ("memory_full", 0): _no_room,
     ("no_time", 0): _no_time_left,
     ("no_clouds", 0): _on_a_card,

@@ -20,7 +20,8 @@ from stereovox.integrate.points import Points
 from stereovox.maps.capped import CappedStorage
 from stereovox.maps.grid_map import GridStorage
 from stereovox.trust import validate
-from stereovox.trust.gate import DisagreementMonitor, Gate
+from stereovox.trust.disagreement import DisagreementMonitor
+from stereovox.trust.gate import Gate
 
 IMAGE, PAIR, CLOUD = "depth image", "stereo pair", "cloud"
 SCAN, IMAGE_SCAN, PAIR_SCAN = "2-D scan", "depth image to scan", "stereo pair to scan"
@@ -153,6 +154,8 @@ CHECKS = (
           "scan.heights"),
     Check("disagrees_with_map", "more of it contradicts the map than is usual for its sensor",
           _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.max_disagreement, trust.pose_error_m"),
+    Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and what they show is no changed world",
+          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.changed_s"),
     Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from elsewhere",
           _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.moved_s"),
     Check("memory_full", "its cells do not fit into `max_memory`",

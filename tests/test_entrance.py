@@ -122,7 +122,6 @@ INSIDE = ("depth/", "integrate/", "trust/")
 DOORS = {
     "mapper.py": "the entrance",
     "deadline.py": "the entrance: prepares frames for `Mapper.add`",
-    "comparison.py": "the entrance: evidence of the very frame that is offered, seen from elsewhere",
     "run.py": "recordings of depth images, pairs and clouds, also those that run now: Mapper.add",
     "floor_run.py": "recordings of robots: GridMapper.add",
     "ros/mapping.py": "ROS 2: Mapper.add and GridMapper.add",

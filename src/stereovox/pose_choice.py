@@ -60,6 +60,11 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
     return chosen._replace(source=opening.open_images(source, frames))
 
 
+def has_poses(source: Stream) -> bool:
+    """Return whether an open source has poses: one of the frames that are looked at does."""
+    return not _missing(source)
+
+
 def poses_of(recording: str) -> str:
     """Return which poses a map was made with (one of `CHOICES`), by the name of its recording."""
     return next((poses for poses, how in HOW.items() if recording.endswith(f", {how}")), GIVEN)

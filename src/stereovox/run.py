@@ -24,7 +24,7 @@ from stereovox.closing import LoopClosure, close, refuse_without_frames
 from stereovox.config import Config, load_config
 from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.summary import mostly_lost, summarise
 from stereovox.frame import UpdateReport
 from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.localize.track import Track
@@ -122,8 +122,9 @@ class MapResult(Generic[MapT]):
             The numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory.
         """
         summary = summarise(self.map, self.reports)
-        if self.doubts:
-            summary["doubts"] = [doubt.as_dict() for doubt in self.doubts]
+        doubts = [doubt.as_dict() for doubt in self.doubts]
+        if doubts := doubts + mostly_lost(summary["frames"], len(self.reports), "frames"):
+            summary["doubts"] = doubts
         if self.poses != GIVEN:
             summary["lost"] = [span.as_dict() for span in self.lost]
             summary["believed"] = self.believed

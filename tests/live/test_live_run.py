@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from time import sleep, time_ns
 
 import numpy as np
 import pytest
 from made_live import Clouds, Images, Sender, free_port, pose_at, udp_sender
+from made_recordings import write_png
 
 from stereovox.cli import main
 from stereovox.config import load_config
@@ -431,6 +433,32 @@ def test_the_command_maps_a_file_of_cameras_and_says_what_became_of_them(tmp_pat
     assert set(result["live"]["latency_ms"]["map"]) == {"median", "p90", "p99", "max"}
     assert "in a browser to see the map grow" in err
     assert "front: 6 images came, 0 dropped" in err
+
+
+def test_a_recording_whose_pose_files_are_all_missing_is_tracked(tmp_path):
+    for k, frame in zip(range(3), open_source("sim:room?image_width=160"), strict=False):
+        write_png(tmp_path / f"frame-{k:06d}.depth.png", np.rint(1000 * np.nan_to_num(frame.depth)).astype(np.uint16))
+    (tmp_path / "camera-intrinsics.txt").write_text("140 0 79.5\n0 140 59.5\n0 0 1\n")
+    assert LiveStream([LiveCamera(tmp_path)]).tracked
+    (tmp_path / "frame-000000.pose.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    assert not LiveStream([LiveCamera(tmp_path)]).tracked
+
+
+def test_a_map_that_holds_little_of_what_came_is_no_success(tmp_path, capsys, monkeypatch):
+    real = Mapper.add
+
+    def few(self, frame):
+        return real(
+            self, frame if frame.name.endswith(" 0") else replace(frame, T_world_sensor=np.full((4, 4), np.nan))
+        )
+
+    monkeypatch.setattr(Mapper, "add", few)
+    words = ["--out", str(tmp_path / "a.svox"), "--set", "voxel_size=0.2", "--json"]
+    assert main(["live", "sim:room?frames=6&image_width=96", *words]) == 3
+    out, err = capsys.readouterr()
+    (doubt,) = json.loads(out.splitlines()[-1])["doubts"]
+    assert (doubt["kind"], doubt["frames"], doubt["offered"]) == ("mostly_lost", 1, 6)
+    assert "but only 1 of 6 images are in the map" in err.splitlines()[-1]
 
 
 def _full(*_, **__):

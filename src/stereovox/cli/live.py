@@ -147,4 +147,5 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     say(cells_line(result))
     for why in failures:
         say(f"not written: {why}")
-    say(f"saved in {arguments.out}; look at it with: {command_line('view', arguments.out)}")
+    few = "".join(f", but {doubt['text']}" for doubt in result.get("doubts", ()) if doubt.get("kind") == "mostly_lost")
+    say(f"saved in {arguments.out}{few}; look at it with: {command_line('view', arguments.out)}")

@@ -175,7 +175,8 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
         say(f"keeps {len(kept)} of its frames, {size(kept.bytes)}: poses can be corrected (remap)")
     if not result["occupied"]:
         say(f"note: {_why_empty(result, config.window)}")
-    say(f"saved in {out}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
+    few = "".join(f", but {doubt['text']}" for doubt in result.get("doubts", ()) if doubt.get("kind") == "mostly_lost")
+    say(f"saved in {out}{few}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
 
 
 def _poses_line(mapped: MapResult[VoxelMap]) -> str:

@@ -129,6 +129,9 @@ def milliseconds(figures: dict[str, float]) -> str:
 def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:
     """Print how many `what` (frames) were mapped, which were refused and why, and when they were accepted again."""
     say(f"{result['frames']} {what} mapped, {result['frames_refused']} refused")
+    for doubt in result.get("doubts", ()):
+        if doubt.get("kind") == "mostly_lost":
+            say(f"warning: {doubt['text']}; the reasons:")
     for reason, number in result["refused"].items():
         example = next(report.detail for report in reports if report.refused == reason)
         say(f"  {number} x {reason}, first: {example}")

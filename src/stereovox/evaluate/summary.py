@@ -41,6 +41,17 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
     }
 
 
+def mostly_lost(frames: int, offered: int, what: str) -> list[dict[str, Any]]:
+    """Return the doubt of a map that holds less than half of what came, for the summary; else nothing.
+
+    frames: of `offered` ones of this run that are in the map. what: what they are called (images).
+    """
+    if 2 * frames >= offered:
+        return []
+    text = f"only {frames} of {offered} {what} are in the map"
+    return [{"kind": "mostly_lost", "frames": frames, "offered": offered, "text": text}]
+
+
 def percentiles(milliseconds: Sequence[float]) -> dict[str, float]:
     """Return median, p90, p99 and max without the first value where there are more; zeros for no values."""
     values = np.percentile(milliseconds[1:] or milliseconds or [0.0], [50, 90, 99, 100])

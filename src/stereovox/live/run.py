@@ -13,7 +13,7 @@ from typing import Any
 
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.summary import mostly_lost, summarise
 from stereovox.frame import UpdateReport
 from stereovox.live.latency import Latency
 from stereovox.live.outputs import GridFile, LiveSphere, Output
@@ -68,6 +68,9 @@ class LiveResult:
             and is not.
         """
         found = {**summarise(self.map, self.reports), "poses": self.poses, "live": self.live}
+        came = sum(counts["received"] for counts in self.live["cameras"].values())
+        if doubts := mostly_lost(found["frames"], came, "images"):
+            found["doubts"] = doubts
         return {**found, "not_written": list(self.failures)} if self.failures else found
 
 

@@ -22,8 +22,8 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
 from stereovox.live.rig import LiveCamera, check_cameras
-from stereovox.opening import open_camera
-from stereovox.pose_choice import GIVEN, HOW, TRACK
+from stereovox.opening import open_camera, open_images
+from stereovox.pose_choice import GIVEN, HOW, TRACK, has_poses
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.base import Stream, imu_of
 from stereovox.sources.clock_watch import OPEN, ClockDoubt, Delays
@@ -427,5 +427,15 @@ def _announced(images: Iterable[AnyFrame], expect: Callable[[AnyFrame], None]) -
 
 
 def _feed(camera: LiveCamera) -> _Feed:
-    stream = open_camera(camera.source) if isinstance(camera.source, str | Path) else camera.source
+    stream = _opened(camera.source) if isinstance(camera.source, str | Path) else camera.source
     return _Feed(camera, stream, round(1e9 * camera.clock_offset_s))
+
+
+def _opened(where: str | Path) -> Stream:
+    """Open a camera; a recording none of whose images has a pose is one without poses, whatever its layout."""
+    stream = open_camera(where)
+    if not isinstance(stream, Paced) or not stream.posed or has_poses(stream.source):
+        return stream
+    images = Paced(open_images(where))
+    images.posed = False
+    return images

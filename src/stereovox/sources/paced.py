@@ -23,13 +23,14 @@ class Paced(Stream):
             their stamps.
 
     Attributes:
+        source: The recording or simulation.
         late: Number of frames that the recording did not deliver in time, by more than half a frame at 30 Hz.
     """
 
     LATE_NS = 16_000_000
 
     def __init__(self, source: Stream, rate: float = 1.0, restamp: bool = True):
-        self._source, self._rate, self._restamp = source, rate, restamp
+        self.source, self._rate, self._restamp = source, rate, restamp
         self.name, self.camera, self.notes = source.name, source.camera, tuple(getattr(source, "notes", ()))
         self.posed = getattr(source, "posed", True)
         self.late = 0
@@ -37,7 +38,7 @@ class Paced(Stream):
 
     def __iter__(self) -> Iterator[AnyFrame]:
         begin_ns = first_ns = shift_ns = 0
-        for k, frame in enumerate(self._source):
+        for k, frame in enumerate(self.source):
             if k == 0:
                 begin_ns, first_ns, shift_ns = monotonic_ns(), frame.stamp_ns, epoch_ns() - frame.stamp_ns
             due_ns = begin_ns + round((frame.stamp_ns - first_ns) / self._rate)

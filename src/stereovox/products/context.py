@@ -84,6 +84,12 @@ class Leaves(NamedTuple):
     unknown: str
 
 
+def nothing(why: str, age: str = "", health: str = "") -> Leaves:
+    """Return that no property has a meaning, but for age and health where they are given."""
+    none = f"not meaningful, because {why}"
+    return Leaves(none, none, none, age or none, health or none, none)
+
+
 WORLD = "carries along: coordinates in the map's world"
 SPACE = "not meaningful, because coordinates in space need no direction up"
 NO_FLOOR = "not meaningful, because no height is measured from a floor"
@@ -125,11 +131,9 @@ OUTPUTS: dict[str, Leaves] = {
         WORLD, "carries along: as its format, below", NO_FLOOR, OFFLINE, JUDGED, "carries along: below"
     ),
     "sv.describe": WHOLE,
-    "sv.write_nav2": Leaves(
-        *5 * ["not meaningful, because it writes settings alone"], "not meaningful, because no map"
-    ),
-    "sv.loops_picture": Leaves(*6 * ["not meaningful, because it draws poses alone"]),
-    "sv.trajectory_picture": Leaves(*6 * ["not meaningful, because it draws poses alone"]),
+    "sv.write_nav2": nothing("it writes settings alone"),
+    "sv.loops_picture": nothing("it draws poses alone"),
+    "sv.trajectory_picture": nothing("it draws poses alone"),
     "sv.open_viewer": Leaves(WORLD, "carries along: up of the page", NO_FLOOR, OFFLINE, JUDGED, SOLID),
     "sv.LiveView": Leaves(
         WORLD, "carries along: up of the page", NO_FLOOR, EVENT, "uses: said, also in silence", SOLID
@@ -154,14 +158,9 @@ OUTPUTS: dict[str, Leaves] = {
         ("topic obstacles", "topic free_rays"),
         GRID._replace(age=OLD, health=OLD, unknown="uses: marks nothing, and ends what is free"),
     ),
-    "topic /diagnostics": Leaves(
-        *3 * ["not meaningful, because it has no coordinates"],
-        "uses: as a value",
-        "uses: its level",
-        "not meaningful, because it has no cells",
-    ),
+    "topic /diagnostics": nothing("it has no cells and coordinates", "uses: as a value", "uses: its level"),
     **dict.fromkeys(("topic tracked_odometry", "topic /tf", "topic amcl_pose", "topic particlecloud"), POSE),
-    "topic map_error": Leaves(*6 * ["not meaningful, because it compares two maps of one frame"]),
-    "topic map": Leaves(*6 * ["not meaningful, because it is the map that was given, or SLAM's own"]),
+    "topic map_error": nothing("it compares two maps of one frame"),
+    "topic map": nothing("it is the map that was given, or SLAM's own"),
 }
 """What each output does with each property: names of `stereovox` (`sv.`), outputs of live runs, formats, ROS topics."""

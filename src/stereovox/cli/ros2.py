@@ -148,8 +148,11 @@ class _Run:
             except Exception:
                 self.save()
                 raise
-            result = _print_result(self.map_node, self.mapping, self.out(), self.reports)
-            return {**result, **_print_ended(ended, self.options.slam_out)}
+            try:
+                result = _print_result(self.map_node, self.mapping, self.out(), self.reports)
+            finally:  # SLAM's map is kept where the other one cannot be
+                more = _print_ended(ended, self.options.slam_out)
+            return {**result, **more}
 
     def save(self) -> None:
         """Save the map as it is."""

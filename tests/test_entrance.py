@@ -93,6 +93,13 @@ def test_good_inputs_are_taken(kind):
     assert mapper.map.counts()["occupied"] > 20
 
 
+@pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
+def test_pixels_of_all_reasons_are_taken(integrator):
+    depth = good("depth image").depth.copy()
+    depth[0, :6] = np.nan, np.inf, -np.inf, 0, -1, 1e30
+    assert mapper_of("depth image", {"integrator": integrator}).add(good("depth image", depth=depth)).refused is None
+
+
 @pytest.mark.parametrize(("check", "number", "kind"), CELLS)
 def test_a_bad_input_is_refused(check, number, kind, monkeypatch):
     assert complaints(check, number, kind, monkeypatch) == []

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
 
+MAX_TILT = np.radians(10.0)
+"""Largest angle between a map's layers and the floor."""
 Heights = tuple[float, float]
 """Lowest and highest metres along the map's `up`, from the world's origin."""
 
@@ -58,3 +60,10 @@ def checked_heights(heights: Heights) -> Heights:
     if not low < high:
         raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
     return low, high
+
+
+def check_level(config: Config) -> None:
+    """Raise StereovoxError where the layers of a map are so far from level that they show no floor."""
+    if config.tilt > MAX_TILT:
+        tilt = f"{np.degrees(config.tilt):.0f} degrees off {config.up}"
+        raise StereovoxError(f"up is {tilt}, so no layer of the map is level; map the recording again with --level")

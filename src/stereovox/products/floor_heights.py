@@ -14,16 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.products.floor_axes import floor_axes
-from stereovox.products.ground_surfaces import NoGroundError, floor_of, ground_levels
+from stereovox.products.floor_axes import check_level, floor_axes
+from stereovox.products.floor_search import FloorSearch
+from stereovox.products.ground_surfaces import NO_SURFACE, floor_of, place_of
 from stereovox.threads import one_state
 
 REACH = 0.5
 """Metres from the nearest floor that was seen, within which its height holds."""
-ROOM = 1.8
-"""Metres above a floor in which nothing is occupied: as high as the default of `scan.heights`."""
-STEP = 0.1
-"""Highest step in metres from one cell of the floor to the next; at least one cell."""
+SMOOTHED = 5
+"""Cells along the sides of the square of which a floor's height is the median: one noisy cell does not lift it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,30 +95,34 @@ class FloorHeights:
 
 @one_state
 def find_floor(voxel_map: VoxelMap, start: ArrayLike | None = None) -> FloorHeights:
-    """Find the floor of a map: heights per place, so that it may slope, and have steps.
+    """Find the floor of a map: heights per place, so that it may slope, and have steps of up to 0.1 m.
+
+    The floor is the lowest large surface near and below the camera of the last frame, with room for 1.8 m above it, and
+    what continues it (`floor_search`). Where it was not seen the nearest floor's height stands, with its distance.
 
     Args:
         voxel_map: The map.
-        start: (3,) metres, near the floor that counts; None: the lowest of the large surfaces.
+        start: (3,) metres, near the floor that counts instead, of several storeys or steps.
 
     Returns:
-        The floor's height at each place; unknown everywhere if the map shows no floor.
+        The floor's height at each place, unknown everywhere if the map shows no floor.
 
     Raises:
-        StereovoxError: The map is too large, or `start` is no place.
+        StereovoxError: The map is too large or not level, or `start` is no place.
     """
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, median_filter
 
+    check_level(voxel_map.config)
     if voxel_map.bounds() is None:
         return FloorHeights.unknown(voxel_map.config.up)
-    floor = floor_of(voxel_map)
-    try:
-        levels = ground_levels(floor, ROOM, max(STEP, floor.side), start)[0]
-    except NoGroundError:
+    floor, viewpoint = floor_of(voxel_map), voxel_map.viewpoint
+    here = None if start is None else place_of(floor, start)
+    camera = None if viewpoint is None else place_of(floor, viewpoint.T_world_camera[:3, 3])
+    levels = FloorSearch(floor, here, camera).levels()
+    if (levels == NO_SURFACE).all():
         return FloorHeights.unknown(voxel_map.config.up)
-    away, nearest = map(np.asarray, distance_transform_edt(np.ma.getmaskarray(levels), return_indices=True) or ())
-    rows, columns = nearest
-    height = (levels.data[rows, columns] - 0.5) * floor.side
+    away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
+    height = (median_filter(levels[tuple(nearest)], SMOOTHED, mode="nearest") - 0.5) * floor.side
     return FloorHeights(
         height.astype(np.float32), (away * floor.resolution).astype(np.float32), floor.resolution, floor.origin,
         voxel_map.config.up,

@@ -27,10 +27,6 @@ BESIDE = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Half of the eight columns beside one."""
 
 
-class NoGroundError(StereovoxError):
-    """A map shows no surface on which something can stand."""
-
-
 @dataclass(frozen=True, eq=False)
 class Floor:
     """The columns of cells of a map, in a picture from above just large enough for what is known.
@@ -106,23 +102,23 @@ def ground_levels(
 ) -> tuple[np.ma.MaskedArray, NDArray[np.int64]]:
     """Return the level of the ground (rows, columns) in cells, masked where there is none, and of the lowest surface.
 
-    What is NO_SURFACE has no surface at all. Raises NoGroundError if there is no ground.
+    What is NO_SURFACE has no surface at all. Raises StereovoxError if there is no ground.
     """
     surfaces = floor.surfaces(height, step)
     if not len(surfaces):
-        raise NoGroundError(
+        raise StereovoxError(
             f"the map has no ground: nothing occupied with {height:g} m free above it; is the map's `up` right?"
         )
     climb = int(step / floor.side + TIE)
     group = components(surfaces, [(*way, rise) for way in BESIDE for rise in range(-climb, climb + 1)])
-    here = None if start is None else _start(floor, start)
-    first = _lowest_large(surfaces, group) if here is None else group[_nearest(floor, surfaces, here)]
-    levels = _lowest(floor.shape, surfaces[group == first], here)
+    here = None if start is None else place_of(floor, start)
+    first = _lowest_large(surfaces, group) if here is None else group[nearest_surface(floor, surfaces, here)]
+    levels = one_level(floor.shape, surfaces[group == first], here)
     _add_islands(levels, surfaces, group, climb, here)
-    return np.ma.masked_equal(levels, NO_SURFACE), _lowest(floor.shape, surfaces, None)
+    return np.ma.masked_equal(levels, NO_SURFACE), one_level(floor.shape, surfaces, None)
 
 
-def _start(floor: Floor, start: ArrayLike) -> NDArray[np.float64]:
+def place_of(floor: Floor, start: ArrayLike) -> NDArray[np.float64]:
     """Return row, column and level of a place in metres, not rounded."""
     place = np.asarray(start, float)
     if place.shape != (3,) or not np.isfinite(place).all():
@@ -139,13 +135,13 @@ def _lowest_large(surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> np.i
     return np.argmin(np.where(size >= LARGE * size.max(), mean, np.inf))
 
 
-def _nearest(floor: Floor, surfaces: NDArray[np.int64], here: NDArray[np.float64]) -> np.intp:
+def nearest_surface(floor: Floor, surfaces: NDArray[np.int64], here: NDArray[np.float64]) -> np.intp:
     """Return which surface is nearest to a place."""
     away = (surfaces + np.array([0.5, 0.5, 0]) - here) * [floor.resolution, floor.resolution, floor.side]
     return np.argmin((away**2).sum(axis=1))
 
 
-def _lowest(shape: tuple[int, ...], surfaces: NDArray[np.int64], here: NDArray[np.float64] | None) -> NDArray[np.int64]:
+def one_level(shape: tuple[int, ...], surfaces: NDArray[np.int64], here: NDArray[np.float64] | None) -> NDArray[np.int64]:
     """Return one level (rows, columns) of the surfaces in each column: nearest in height to a place, or the lowest."""
     order = np.argsort(-surfaces[:, 2] if here is None else -np.abs(surfaces[:, 2] - here[2]), kind="stable")
     levels = np.full(shape, NO_SURFACE, np.int64)
@@ -170,5 +166,5 @@ def _add_islands(
     order = np.lexsort((rise, run))  # the nearest of each group comes first
     _, firsts = np.unique(group[order], return_index=True)
     level = rise[order[firsts]] <= climb
-    more = _lowest(levels.shape, surfaces[level[group]], here)
+    more = one_level(levels.shape, surfaces[level[group]], here)
     np.copyto(levels, more, where=levels == NO_SURFACE)

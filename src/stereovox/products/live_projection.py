@@ -34,7 +34,7 @@ class LiveProjection:
     """
 
     def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
-        check_level(voxel_map)
+        check_level(voxel_map.config)
         self._map, config = voxel_map, voxel_map.config
         self._order = list(floor_axes(config.up)[:3])
         across, along, up = self._order

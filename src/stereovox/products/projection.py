@@ -32,8 +32,6 @@ TILE = 64
 INFLATE_TIE = 1e-6
 EMPTY = np.iinfo(np.int16).min
 """Stored value of a column in which nothing is known; no cell is stored as this."""
-MAX_TILT = np.radians(10.0)
-"""Largest angle between a map's layers and the floor."""
 MAX_CELLS = 2**30
 """Cells of the largest grid."""
 TIE = 1e-9
@@ -53,7 +51,7 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError where no cell between the heights is known, for too large a grid, or a map that is not level.
     """
-    check_level(voxel_map)
+    check_level(voxel_map.config)
     order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
@@ -64,14 +62,6 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     if patch is None or not (patch.marked != EMPTY).any():
         raise StereovoxError(_format_empty(voxel_map, order[2], heights))
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
-
-
-def check_level(voxel_map: VoxelMap) -> None:
-    """Raise StereovoxError where the layers of a map are so far from level that they show no floor."""
-    config = voxel_map.config
-    if config.tilt > MAX_TILT:
-        tilt = f"{np.degrees(config.tilt):.0f} degrees off {config.up}"
-        raise StereovoxError(f"up is {tilt}, so no layer of the map is level; map the recording again with --level")
 
 
 class Patch(NamedTuple):

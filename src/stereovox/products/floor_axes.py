@@ -9,10 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
 
+MAX_CELLS = 2**30
+"""Cells of the largest grid."""
 MAX_TILT = np.radians(10.0)
 """Largest angle between a map's layers and the floor."""
 Heights = tuple[float, float]
-"""Lowest and highest metres along the map's `up`, from the world's origin."""
+"""Lowest and highest metres above the floor."""
 
 
 def floor_axes(up: str) -> tuple[int, int, int, int]:
@@ -55,10 +57,12 @@ def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
 
 
 def checked_heights(heights: Heights) -> Heights:
-    """Validate two heights; raises StereovoxError where they do not ascend."""
+    """Validate two heights above the floor; raises StereovoxError if they do not ascend from 0 or more."""
     low, high = heights
-    if not low < high:
-        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
+    if not (0 <= low < high < np.inf):
+        raise StereovoxError(
+            f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres above the floor, 0 or more"
+        )
     return low, high
 
 

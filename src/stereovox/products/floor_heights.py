@@ -12,15 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.products.floor_axes import check_level, floor_axes
+from stereovox.products.floor_axes import Heights, check_level, floor_axes
 from stereovox.products.floor_search import FloorSearch
 from stereovox.products.ground_surfaces import NO_SURFACE, floor_of, place_of
 from stereovox.threads import one_state
 
 REACH = 0.5
 """Metres from the nearest floor that was seen, within which its height holds."""
+TIE = 1e-4
+"""Cells: lengths that are so near to whole cells are."""
 SMOOTHED = 5
 """Cells along the sides of the square of which a floor's height is the median: one noisy cell does not lift it."""
 
@@ -36,7 +39,7 @@ class FloorHeights:
         resolution: Side of a cell in metres.
         origin: x, y, yaw of the corner of cell (0, 0), in the axes of `projection.project`.
         up: The axis of the map that points up.
-        elsewhere: Height in metres of the floor outside of the picture; NaN if it is unknown there.
+        elsewhere: Height in metres of a floor that is stated to be level everywhere; NaN for one that was found.
     """
 
     height: NDArray[np.float32]
@@ -85,12 +88,76 @@ class FloorHeights:
         """
         x, y, _, _ = floor_axes(self.up)
         across = np.asarray(points, float).reshape(-1, 3)[:, [x, y]]
-        columns, rows = np.floor((across - self.origin[:2]) / self.resolution + 1e-9).astype(np.int64).T
-        inside = (rows >= 0) & (columns >= 0) & (rows < self.height.shape[0]) & (columns < self.height.shape[1])
-        found = np.full(len(across), self.elsewhere)
-        near = self.away[rows[inside], columns[inside]] <= reach
-        found[inside] = np.where(near, self.height[rows[inside], columns[inside]], self.elsewhere)
-        return found
+        columns, rows = np.floor((across - self.origin[:2]) / self.resolution + TIE).astype(np.int64).T
+        height, away = self._nearest(rows, columns)
+        return np.where(away <= reach, height, np.nan)
+
+    def layers(
+        self, low: NDArray[np.int64], high: NDArray[np.int64], config: Config, heights: Heights
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+        """Return which layers of a map's cells lie within heights above the floor.
+
+        Args:
+            low: (2,) first column and row, in cells of the map.
+            high: (2,) column and row after the last.
+            config: Settings of the map.
+            heights: Lowest and highest metres above the floor. A cell of which any part lies between them counts, but
+                never the cell that the floor itself lies in.
+
+        Returns:
+            First and last layer (rows, columns) int32 along the map's axis, the first above the last where no floor is
+            known; and whether the floor was seen within REACH (rows, columns).
+        """
+        _, _, up, sign = floor_axes(self.up)
+        side = config.cell[up]
+        height, away = self._within(low, high)
+        known = ~np.isnan(height)
+        floor = np.where(known, height, 0.0)
+        lowest = np.maximum(np.floor((floor + heights[0]) / side + TIE), np.floor(floor / side + TIE) + 1)
+        top = np.ceil((floor + heights[1]) / side - TIE) - 1
+        lowest, top = (lowest, top) if sign > 0 else (-1 - top, -1 - lowest)
+        limits = np.iinfo(np.int32).min // 2, np.iinfo(np.int32).max // 2
+        lowest, top = (np.clip(ends, *limits).astype(np.int32) for ends in (lowest, top))
+        return np.where(known, lowest, limits[1]).astype(np.int32), top, known & (away <= REACH)
+
+    def moved_from(self, before: FloorHeights) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+        """Return first column and row, and those after the last, in cells of the map, between which the floor is no
+        longer as it was; None if nothing moved."""
+        boxes = [one._box() for one in (self, before) if one.height.size]
+        if not boxes:
+            return None
+        low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        (height, away), (height_before, away_before) = (one._within(low, high) for one in (self, before))
+        other = (height != height_before) & ~(np.isnan(height) & np.isnan(height_before))
+        other |= (away <= REACH) != (away_before <= REACH)
+        rows, columns = (np.flatnonzero(other.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return None
+        return low + np.array([columns[0], rows[0]]), low + np.array([columns[-1], rows[-1]]) + 1
+
+    def _box(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return first column and row of the picture in cells of the map, and those after the last."""
+        first = np.rint(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
+        return first, first + self.height.shape[::-1]
+
+    def _within(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the nearest height and its distance (rows, columns) in a box of columns of the map."""
+        first, _ = self._box()
+        rows, columns = np.ogrid[low[1] - first[1] : high[1] - first[1], low[0] - first[0] : high[0] - first[0]]
+        return self._nearest(*np.broadcast_arrays(rows, columns))
+
+    def _nearest(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the height of the nearest floor that was seen, NaN for none, and how far away it is in metres.
+
+        rows, columns: of one shape, in cells of this picture; they may lie outside of it.
+        """
+        if not self.height.size:
+            return np.full(rows.shape, self.elsewhere), np.zeros(rows.shape)
+        inside = tuple(np.clip(at, 0, n - 1) for at, n in zip((rows, columns), self.height.shape, strict=True))
+        outside = np.hypot(rows - inside[0], columns - inside[1]) * self.resolution
+        return self.height[inside].astype(float), self.away[inside] + outside
 
 
 @one_state

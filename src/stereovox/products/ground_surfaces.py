@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
-from stereovox.products.floor_axes import floor_axes
+from stereovox.products.floor_axes import MAX_CELLS, floor_axes
 from stereovox.products.neighbours import components
-from stereovox.products.projection import MAX_CELLS
 from stereovox.products.side_by_side import in_memory
 
 TIE = 1e-6
@@ -141,7 +140,9 @@ def nearest_surface(floor: Floor, surfaces: NDArray[np.int64], here: NDArray[np.
     return np.argmin((away**2).sum(axis=1))
 
 
-def one_level(shape: tuple[int, ...], surfaces: NDArray[np.int64], here: NDArray[np.float64] | None) -> NDArray[np.int64]:
+def one_level(
+    shape: tuple[int, ...], surfaces: NDArray[np.int64], here: NDArray[np.float64] | None
+) -> NDArray[np.int64]:
     """Return one level (rows, columns) of the surfaces in each column: nearest in height to a place, or the lowest."""
     order = np.argsort(-surfaces[:, 2] if here is None else -np.abs(surfaces[:, 2] - here[2]), kind="stable")
     levels = np.full(shape, NO_SURFACE, np.int64)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from time import monotonic
 from weakref import WeakMethod
 
 import numpy as np
@@ -16,8 +18,9 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.storage import EVERYWHERE
-from stereovox.products.floor_axes import Heights, floor_axes
-from stereovox.products.projection import EMPTY, Patch, check_level, layers_of, patch_of
+from stereovox.products.floor_axes import Heights, check_level, checked_heights, floor_axes
+from stereovox.products.floor_heights import FloorHeights, find_floor
+from stereovox.products.projection import CURE, NO_FLOOR, patch_of, shown_percent
 
 STEP = 8 * SIDE
 """The grid grows by this many cells, so that planners need not reallocate with each frame."""
@@ -25,22 +28,53 @@ MAX_CELLS = 2**26
 """Cells of the largest grid; more is too much to send with each frame."""
 
 
+FLOOR_S = 1.0
+"""Seconds between two searches for the floor."""
+SHARE = 10.0
+"""The next search waits so many times as long as the last one took."""
+TOLD_AFTER = 3
+"""Searches without a floor after which the user is informed."""
+
+
 class LiveProjection:
     """Projects a map from above, as `projection.project`, at the cost of what changed.
 
-    heights: as for `project`. The grid covers what is known, in steps of 64 cells. Of a map in a window only the cells
-    in memory count; such a map, and one that forgets, is projected as a whole each time. Raises StereovoxError where
-    the heights hold no cell, where cells are not as long as wide, and for a map that is not level.
+    The floor is sought anew at most once each `floor_s` seconds, and takes at most a tenth of the time; places whose
+    floor moved are projected again. While no floor is known, every cell is unknown. The grid covers what is known, in
+    steps of 64 cells. Of a map in a window only the cells in memory count; such a map, and one that forgets, is
+    projected as a whole each time.
+
+    Args:
+        voxel_map: The map.
+        heights: As for `project`.
+        floor: Metres along the map's `up` of a floor that is stated to be level; None: it is found.
+        floor_s: Seconds between two searches for the floor.
+        notify: Called once with a line, if the map goes on without a floor.
+        clock: Monotonic seconds.
+
+    Raises:
+        StereovoxError: The heights make no sense, cells are not as long as wide, or the map is not level.
     """
 
-    def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
+    def __init__(
+        self,
+        voxel_map: VoxelMap,
+        heights: Heights | None = None,
+        floor: float | None = None,
+        floor_s: float = FLOOR_S,
+        notify: Callable[[str], None] = lambda line: None,
+        clock: Callable[[], float] = monotonic,
+    ):
         check_level(voxel_map.config)
         self._map, config = voxel_map, voxel_map.config
         self._order = list(floor_axes(config.up)[:3])
-        across, along, up = self._order
+        across, along, _ = self._order
         if config.cell[across] != config.cell[along]:
             raise StereovoxError(f"steps {list(config.cell)}: a grid of the floor needs cells as long as wide")
-        self._layers = layers_of(voxel_map, up, heights or config.scan.heights)
+        self._heights = checked_heights(heights or config.scan.heights)
+        self._floor = FloorHeights.unknown(config.up) if floor is None else FloorHeights.level(floor, config.up)
+        self._floor_s, self._notify, self._clock = floor_s, notify, clock
+        self._due, self._tries, self._stated = -np.inf, 0, floor is not None
         self._percent = Percent(CellRules(config.map))
         self._whole = isinstance(voxel_map, RollingMap) or config.map.forget_s is not None
         self._changed = EVERYWHERE.copy()
@@ -48,13 +82,36 @@ class LiveProjection:
         note = WeakMethod(self._note)  # the map does not keep alive what only looks at it
         voxel_map.storage.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
+    @property
+    def floor(self) -> FloorHeights:
+        """The floor that heights were last measured from."""
+        return self._floor
+
     def grid(self) -> OccupancyGrid | None:
         """Return the current map from above, None where nothing is known. Its cells are a copy.
 
         Raises StereovoxError for too large a grid.
         """
         with self._map.lock:  # `_note` is called with it held
+            self._seek_floor()
             return self._grid()
+
+    def _seek_floor(self) -> None:
+        """Find the floor if that is due and the map changed, and note where it moved."""
+        now = self._clock()
+        if self._stated or now < self._due or (self._changed[0] >= self._changed[1]).any():
+            return
+        before, self._floor = self._floor, find_floor(self._map)
+        self._due = now + max(self._floor_s, SHARE * (self._clock() - now))
+        self._tries = 0 if self._floor.known else self._tries + 1
+        if self._tries == TOLD_AFTER:
+            self._notify(f"{NO_FLOOR}; {CURE}")
+        if moved := self._floor.moved_from(before):
+            low, high = moved
+            here = self._order[:2]
+            self._changed[0, here] = np.minimum(self._changed[0, here], low // SIDE)
+            self._changed[1, here] = np.maximum(self._changed[1, here], -(-high // SIDE))
+            self._changed[:, self._order[2]] = EVERYWHERE[:, self._order[2]]
 
     def _note(self, evidence: Evidence) -> None:
         """Add the columns that a frame changed to those to be projected again."""
@@ -74,15 +131,10 @@ class LiveProjection:
         if len(coords):
             floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
             self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
-            patch = patch_of(self._map, coords, cells, self._order, self._layers)
-            self._canvas.paint(self._in_percent(patch), patch.corner)
+            patch = patch_of(self._map, coords, cells, self._order, self._floor, self._heights)
+            self._canvas.paint(shown_percent(patch, self._percent), patch.corner)
         self._changed = EVERYWHERE[::-1].copy()
         return self._shown()
-
-    def _in_percent(self, patch: Patch) -> NDArray[np.int8]:
-        number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared).astype(np.int32)
-        known = self._percent.shown[np.maximum(number, self._percent.lowest) - self._percent.lowest]
-        return np.where(number == EMPTY, np.int8(UNKNOWN), known)
 
     def _shown(self) -> OccupancyGrid | None:
         if not self._canvas.cells.size:

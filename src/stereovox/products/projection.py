@@ -21,7 +21,8 @@ from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.products import _projection
-from stereovox.products.floor_axes import Heights, floor_axes
+from stereovox.products.floor_axes import MAX_CELLS, Heights, check_level, checked_heights, floor_axes
+from stereovox.products.floor_heights import FloorHeights, find_floor
 from stereovox.products.transform import transformed
 from stereovox.threads import one_state
 
@@ -32,44 +33,70 @@ TILE = 64
 INFLATE_TIE = 1e-6
 EMPTY = np.iinfo(np.int16).min
 """Stored value of a column in which nothing is known; no cell is stored as this."""
-MAX_CELLS = 2**30
-"""Cells of the largest grid."""
-TIE = 1e-9
+NEVER = -1
+NO_FLOOR = "the map shows no floor, so heights above it are unknown and nothing is free"
+CURE = "look at the floor with the camera, or state its height in the world: floor=Z, --floor Z (metres along up)"
 
 
 @one_state
-def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGrid:
-    """Return the map seen from above, just large enough for what is known.
+def project(
+    voxel_map: VoxelMap,
+    heights: Heights | None = None,
+    floor: FloorHeights | float | None = None,
+    start: ArrayLike | None = None,
+) -> OccupancyGrid:
+    """Return the map seen from above, just large enough for what is known, as a robot on its floor needs it.
 
-    heights: lowest and highest metres along the map's `up`, from the world's origin, between which a cell's centre
-    marks; None: the map's own `scan.heights`.
-    The heights only limit marking. A column has the largest probability of all its known cells between them: an
-    occupied one makes it occupied (a table top is no thicker), one that is neither keeps it from being free. Where
-    nothing between them is known, free cells at any other height clear the column, and it has the largest probability
-    of those. Otherwise it is unknown.
-    The grid's x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z
-    for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
-    Raises StereovoxError where no cell between the heights is known, for too large a grid, or a map that is not level.
+    Heights are measured above the floor at each place, never from the world's origin. A column has the largest
+    probability of all its known cells within the heights: an occupied one makes it occupied (a table top is no
+    thicker), one that is neither keeps it from being free. It is free only if all its cells within the heights are
+    known to be free, and the floor was seen within `floor_heights.REACH`. Otherwise it is unknown: a camera that never
+    saw the top of the band does not clear it, so give the true height of a lower robot.
+
+    The grid's x and y are the map's if z is up; else the two axes that make a right-handed frame with `up`: y and z
+    for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes if the floor needs it.
+
+    Args:
+        voxel_map: The map.
+        heights: Lowest and highest metres above the floor that a robot occupies; None: the map's own `scan.heights`.
+        floor: Height of the floor at each place; a number states that it is level, at so many metres along the map's
+            `up` from the world's origin; None: it is found.
+        start: (3,) metres, near the floor that counts, where it is found; see `find_floor`.
+
+    Returns:
+        The grid. Cells above an unknown floor are unknown.
+
+    Raises:
+        StereovoxError: The floor is unknown, no cell within the heights is known, the grid is too large, or the map is
+            not level.
     """
     check_level(voxel_map.config)
     order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
-    heights = heights or voxel_map.config.scan.heights
-    layers = layers_of(voxel_map, order[2], heights)
-    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.storage.slabs() if len(slab[0])]
-    patch = _joined(patches)
+    heights = checked_heights(heights or voxel_map.config.scan.heights)
+    if not isinstance(floor, FloorHeights):
+        floor = find_floor(voxel_map, start) if floor is None else FloorHeights.level(floor, voxel_map.config.up)
+    if not floor.known:
+        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
+    slabs = (slab for slab in voxel_map.storage.slabs() if len(slab[0]))
+    patch = _joined([patch_of(voxel_map, *slab, order, floor, heights) for slab in slabs])
     if patch is None or not (patch.marked != EMPTY).any():
-        raise StereovoxError(_format_empty(voxel_map, order[2], heights))
+        raise StereovoxError(f"nothing is known {heights[0]:g} to {heights[1]:g} m above the floor; give other heights")
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
 class Patch(NamedTuple):
-    """Some blocks seen from above: lowest column and row, and (rows, columns) int16 as `look_down` fills them."""
+    """Some blocks seen from above: lowest column and row, and arrays (rows, columns).
+
+    marked, free: int16, as `look_down` fills them. wanted: int32, how many cells must be free for the column to be so;
+    NEVER if its floor was not seen nearby.
+    """
 
     corner: NDArray[np.int64]
     marked: NDArray[np.int16]
-    cleared: NDArray[np.int16]
+    free: NDArray[np.int16]
+    wanted: NDArray[np.int32]
 
 
 def patch_of(
@@ -77,34 +104,33 @@ def patch_of(
     coords: NDArray[np.int32],
     values: NDArray[np.integer],
     order: list[int],
-    layers: NDArray[np.int64],
+    floor: FloorHeights,
+    heights: Heights,
 ) -> Patch:
     """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
 
-    order: axes along columns, along rows and up, see `floor_axes`; layers: as `layers_of` returns them.
+    order: axes along columns, along rows and up, see `floor_axes`.
     """
-    floor = coords[:, order[:2]].astype(np.int64)
-    low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE
-    patch = _empty(low, high)
+    across = coords[:, order[:2]].astype(np.int64)
+    low, high = across.min(axis=0) * SIDE, (across.max(axis=0) + 1) * SIDE
+    check_size(low, high)
+    first, last, near = floor.layers(low, high, voxel_map.config, heights)
+    marked, free = np.full(first.shape, EMPTY, np.int16), np.zeros(first.shape, np.int16)
     rules = CellRules(voxel_map.config.map)
     _projection.look_down(
-        np.ascontiguousarray(coords), np.ascontiguousarray(values), np.array(order), low, layers,
-        np.int16(rules.format.unknown), np.int16(np.ceil(rules.free_below)), patch.marked, patch.cleared,
+        coords, values, np.array(order), low, first, last, np.int16(rules.format.unknown),
+        np.int16(ceil(rules.free_below)), marked, free,
     )  # fmt: skip
-    return patch
+    return Patch(low, marked, free, np.where(near, last - first + 1, NEVER).astype(np.int32))
 
 
-def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
-    """Return the first and the last layer of cells whose middle is above the lower height, and not above the upper."""
-    low, high = heights
-    if not (np.isfinite(heights).all() and low < high):
-        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
-    step = voxel_map.config.cell[axis]
-    below, top = np.floor(np.array(heights) / step - 0.5 + TIE)
-    layers = np.clip([below + 1, top], -(2.0**40), 2.0**40).astype(np.int64)
-    if layers[0] > layers[1]:
-        raise StereovoxError(f"heights {low:g}:{high:g} hold the middle of no cell of {step:g} m; widen them")
-    return -1 - layers[::-1] if voxel_map.config.up.startswith("-") else layers
+def shown_percent(patch: Patch, percent: Percent) -> NDArray[np.int8]:
+    """Return the cells (rows, columns) of a grid: per cent occupied, -1 for unknown."""
+    lowest = percent.lowest
+    shown = percent.shown[np.maximum(patch.marked, lowest).astype(np.int32) - lowest]
+    seen_free = patch.free == patch.wanted
+    may_show = (shown >= 100 * percent.free_below) | seen_free
+    return np.where((patch.marked != EMPTY) & may_show, shown, np.int8(UNKNOWN))
 
 
 @one_state
@@ -172,45 +198,36 @@ def _check(radius: float, margin: int) -> None:
         raise StereovoxError(f"margin {margin}: give a number of cells, 0 or more")
 
 
-def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
+def check_size(low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+    """Raise StereovoxError if a grid from column and row `low` to below `high` is too large."""
     columns, rows = (high - low).tolist()
     if columns * rows > MAX_CELLS:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )
-    return Patch(low, np.full((rows, columns), EMPTY, np.int16), np.full((rows, columns), EMPTY, np.int16))
 
 
 def _joined(patches: list[Patch]) -> Patch | None:
     if len(patches) < 2:
         return patches[0] if patches else None
     ends = [patch.corner + patch.marked.shape[::-1] for patch in patches]
-    joined = _empty(np.min([patch.corner for patch in patches], axis=0), np.max(ends, axis=0))
+    low, high = np.min([patch.corner for patch in patches], axis=0), np.max(ends, axis=0)
+    check_size(low, high)
+    shape = tuple((high - low)[::-1])
+    joined = Patch(low, np.full(shape, EMPTY, np.int16), np.zeros(shape, np.int16), np.full(shape, NEVER, np.int32))
     for patch in patches:
-        (left, bottom), (rows, columns) = (patch.corner - joined.corner).tolist(), patch.marked.shape
+        (left, bottom), (rows, columns) = (patch.corner - low).tolist(), patch.marked.shape
         here = slice(bottom, bottom + rows), slice(left, left + columns)
-        for whole, part in ((joined.marked, patch.marked), (joined.cleared, patch.cleared)):
-            whole[here] = np.maximum(whole[here], part)
+        joined.marked[here] = np.maximum(joined.marked[here], patch.marked)
+        joined.free[here] += patch.free
+        joined.wanted[here] = patch.wanted
     return joined
 
 
 def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
-    number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared)
-    rows, columns = (np.flatnonzero((number != EMPTY).any(axis=across)) for across in (1, 0))
-    number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     percent = Percent(CellRules(voxel_map.config.map))
-    known = percent.shown[np.maximum(number, percent.lowest).astype(np.int32) - percent.lowest]
+    cells, known = shown_percent(patch, percent), patch.marked != EMPTY
+    rows, columns = (np.flatnonzero(known.any(axis=across)) for across in (1, 0))
+    cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).round(9).tolist()
-    return OccupancyGrid(
-        np.where(number == EMPTY, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
-        percent.free_below, percent.occupied_above,
-    )  # fmt: skip
-
-
-def _format_empty(voxel_map: VoxelMap, axis: int, heights: Heights) -> str:
-    bounds = voxel_map.bounds()
-    if bounds is None:
-        return "the map is empty: there is nothing to project"
-    low, high = bounds[:, axis] if not voxel_map.config.up.startswith("-") else -bounds[::-1, axis]
-    between = f"nothing is known at heights {heights[0]:g} to {heights[1]:g} m"
-    return f"{between}, the map's own are {low:.2f} to {high:.2f} m; choose others with --heights=LO:HI"
+    return OccupancyGrid(cells, side, (left, bottom, 0.0), percent.free_below, percent.occupied_above)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.cli.maps import dimensions, open_map, refuse_options
-from stereovox.cli.options import heights_of
+from stereovox.cli.options import heights_of, point
 from stereovox.cli.terminal import say, size
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
@@ -26,8 +26,17 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--heights",
         metavar="LO:HI",
-        help="2-D maps and bags: heights in metres between which obstacles count (the map's scan.heights); free cells"
-        " at any height clear. Below zero: --heights=-0.5:1",
+        help="2-D maps and bags: metres above the floor that a robot occupies (the map's scan.heights); free is what was"
+        " seen free in all of them",
+    )
+    parser.add_argument(
+        "--floor",
+        type=float,
+        metavar="Z",
+        help="2-D maps and bags: height in metres of a level floor in the world (found at each place)",
+    )
+    parser.add_argument(
+        "--start", type=point, metavar="X,Y,Z", help="2-D maps and bags: a place near the floor that counts, of several"
     )
     parser.add_argument(
         "--inflate",
@@ -46,12 +55,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if dimensions(arguments.map) == 2 and ending in BAGS:
         return _export_floor(arguments)
     voxel_map = open_map(arguments.map)
-    export(voxel_map, file, heights, arguments.inflate)
+    export(voxel_map, file, heights, arguments.inflate, arguments.floor, arguments.start)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
     beside = ""
     if ending in (*FLAT, *BAGS):
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
-        say(f"seen from above: what is {low:g} to {high:g} m high marks a cell; others: --heights=LO:HI")
+        stated = voxel_map.config.scan.floor if arguments.floor is None else arguments.floor
+        where = "found at each place" if stated is None or arguments.start else f"stated to be at {stated:g} m"
+        say(f"seen from above: {low:g} to {high:g} m above the floor, which is {where}")
+        say("free is what was seen free in all of that; for a lower robot: --heights LO:HI")
     if arguments.inflate is not None:
         result["inflated_m"] = arguments.inflate
         say(f"obstacles grown by {arguments.inflate:g} m and one cell")
@@ -66,7 +78,7 @@ def _export_floor(arguments: Namespace) -> dict[str, Any]:
     from stereovox.formats.bags import write_grid_bag
     from stereovox.formats.map_server import read_map_server
 
-    refuse_options(arguments, ["heights", "inflate"], "a floor's map goes into a bag as it is")
+    refuse_options(arguments, ["heights", "inflate", "floor", "start"], "a floor's map goes into a bag as it is")
     write_grid_bag(read_map_server(arguments.map), arguments.file)
     say(f"saved {arguments.file}")
     return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}

@@ -28,7 +28,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--longest", type=float, default=2.0, metavar="M", help="longer frontiers are split in half (2 metres)"
     )
-    parser.add_argument("--heights", metavar="LO:HI", help="heights in metres between which cells count (all)")
+    parser.add_argument("--heights", metavar="LO:HI", help="metres above the floor between which cells count (all)")
     parser.add_argument(
         "--start", type=point, metavar="X,Y,Z", help="where the robot is, in metres (the camera of the last frame)"
     )

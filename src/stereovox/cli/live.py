@@ -55,7 +55,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="how long to map (until Ctrl-C)")
     parser.add_argument("--grid", metavar="FILE.yaml", help="2-D map (map_server) to keep up to date")
-    parser.add_argument("--heights", metavar="LO:HI", help="heights in which obstacles mark it (scan.heights)")
+    parser.add_argument(
+        "--heights", metavar="LO:HI", help="metres above the floor that a robot occupies (scan.heights)"
+    )
     parser.add_argument("--sphere", metavar="FILE.png", help="picture of the distances all round, at the end")
     parser.add_argument("--record", metavar="FILE.mcap", help="record depth images and poses beside (.bag, .db3)")
     parser.add_argument(

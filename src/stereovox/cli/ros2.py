@@ -177,7 +177,7 @@ def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping
     say_about_compiling()
     warm_up(config, options.poses == TRACK, options.localised, bool(options.cloud or options.scan))
     tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
-    mapping = Mapping(config, options.heights, tiles)
+    mapping = Mapping(config, options.heights, tiles, node.get_logger().warning)
     stack.callback(mapping.close)
     if arguments.load:
         check_continuable(arguments.load, options.poses not in (TRACK, SLAM))

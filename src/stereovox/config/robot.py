@@ -16,13 +16,16 @@ class ScanConfig(Section):
     method: `rows` takes the nearest of `rows` rows round the row that looks level, for level cameras; `cloud` takes the
         nearest point between `heights`, for tilted ones.
     rows: 1 is the middle row alone (IST 2019). off_level_deg: largest angle of that row off the level.
-    heights: lowest and highest metres over the floor (z of the world) that count as an obstacle.
+    heights: lowest and highest metres above the floor that a robot occupies: what lies between them is an obstacle.
+    floor: height of a level floor in metres along `up`, from the world's origin. Not set: in a map in space the floor
+        is found at each place; for scans out of depth images it is 0.
     angle_step_deg: width of a beam; not set: that of a pixel in the middle of the image.
     """
 
     method: Literal["rows", "cloud"] = "cloud"
     rows: int = Field(1, ge=1, le=4096)
     heights: tuple[float, float] = (0.1, 1.8)
+    floor: float | None = Field(None, ge=-1e5, le=1e5)
     off_level_deg: float = Field(2.0, gt=0, le=20)
     angle_step_deg: float | None = Field(None, ge=0.01, le=10)
 

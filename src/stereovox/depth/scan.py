@@ -26,12 +26,14 @@ FLOOR_NOISE = 1.25
 """Factor on the smallest measured depth within which TOO_NEAR may be the floor."""
 SPARSE = 4
 """Step between the rows and columns that are searched for that depth."""
+DEEP, MOST_DEEP = 0.3, 0.1
+"""No more than such a share of what a camera sees lies so many metres below the floor: stairs that lead down."""
 WHOLE = 1e-3
 """A beam that is free up to `range_max` except this share of it is free up to it: rays are not exactly level."""
 
 
 def scan_of(image: DepthImage, config: Config) -> Scan:
-    """Return the scan of a depth image; the world's z is the height above the floor.
+    """Return the scan of a depth image; the floor is level, at `scan.floor`, or else at 0.
 
     The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
     the floor. The mount on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows` takes
@@ -47,7 +49,9 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
 
     Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
-    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
+    looks straight up or down, `heights_not_seen` where no ray meets the heights, `below_floor` where
+    the camera, or much of what it sees, lies below the floor, so that the floor is elsewhere; ConfigError where z is
+    not up.
     """
     if config.up.removeprefix("+") != "z":
         raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
@@ -56,10 +60,12 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     if config.scan.method == "rows":
         rows = level_rows(image, rays, turn, config.scan.rows, config.scan.off_level_deg)
         rays, heights = rays.of_rows(rows), (-np.inf, np.inf)
-    check_heights(image, rays, turn, heights, config.max_range)
+    camera = float(image.T_world_sensor[2, 3]) - (config.scan.floor or 0.0)
+    check_floor(image, turn, camera)
+    check_heights(image, rays, turn, heights, config.max_range, camera)
     step = config.scan.angle_step_deg
     where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
-    camera, depths = image.T_world_sensor[2, 3], (config.min_range, config.max_range)
+    depths = config.min_range, config.max_range
     floor = FLOOR_NOISE * max(config.min_range, nearest(image)) if heights[0] > 0 else 0.0
     band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST, floor], np.float32))
     beams = _gathered(image.depth_m[rows], image.reason[rows], rays, turn, band, where)
@@ -196,10 +202,13 @@ def directions(rays: Rays, turn: NDArray[np.float64], step: float) -> tuple[Dire
 
 
 def check_heights(
-    image: DepthImage, rays: Rays, turn: NDArray[np.float64], heights: tuple[float, float], far: float
+    image: DepthImage, rays: Rays, turn: NDArray[np.float64], heights: tuple[float, float], far: float, at: float
 ) -> None:
-    """Raise FrameRefused `heights_not_seen` where no ray is within `heights` before `far` metres of depth."""
-    (low, high), at = heights, float(image.T_world_sensor[2, 3])
+    """Raise FrameRefused `heights_not_seen` where no ray is within `heights` before `far` metres of depth.
+
+    at: height of the camera above the floor in metres.
+    """
+    low, high = heights
     across, rise = turn[2, 0] * rays.columns, rays.rows @ turn[2, 1:]
     lowest = at + far * min(float(across.min() + rise.min()), 0.0)
     highest = at + far * max(float(across.max() + rise.max()), 0.0)
@@ -208,6 +217,24 @@ def check_heights(
             "heights_not_seen",
             f"{name(image)}: the camera, {at:.2f} m high, sees nothing of scan.heights {low:g} to {high:g} m;"
             " set scan.heights, or check the camera's pose",
+        )
+
+
+def check_floor(image: DepthImage, turn: NDArray[np.float64], at: float) -> None:
+    """Raise FrameRefused `below_floor` where a camera `at` metres above the floor shows that the floor is elsewhere.
+
+    It would be so in a world that begins at the camera: then all obstacles lie below the heights that count.
+    """
+    some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
+    columns, rows = image.camera.rays()
+    rise = turn[2, 0] * columns[None, ::SPARSE] + (rows[::SPARSE] @ turn[2, 1:])[:, None]
+    deep = (at + image.depth_m[some] * rise)[image.reason[some] == Reason.VALID] < -DEEP
+    share = float(deep.mean()) if deep.size else 0.0
+    if at <= 0 or share > MOST_DEEP:
+        raise FrameRefused(
+            "below_floor",
+            f"{name(image)}: the camera is {at:.2f} m above the floor of the settings, and {share:.0%} of what it sees lies"
+            " below that floor; set scan.floor to the floor's height in the world of the poses, in metres",
         )
 
 

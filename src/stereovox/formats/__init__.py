@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
+from numpy.typing import ArrayLike
+
 from stereovox import registry
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.formats.octomap import read_octomap
@@ -80,7 +82,12 @@ __all__ = ["BAGS", "CLOUDS", "EXPORTS", "FLAT", "FLOORS", "IMPORTS", "export", "
 
 
 def export(
-    voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] | None = None, inflate: float | None = None
+    voxel_map: VoxelMap,
+    path: str | Path,
+    heights: tuple[float, float] | None = None,
+    inflate: float | None = None,
+    floor: float | None = None,
+    start: ArrayLike | None = None,
 ) -> None:
     """Write a map in the format that the file name's ending selects; a failed export leaves an older file intact.
 
@@ -89,23 +96,28 @@ def export(
     Args:
         voxel_map: The map.
         path: File to write; `EXPORTS` lists the endings.
-        heights: For 2-D maps and bags: lowest and highest metres that mark cells (see `projection.project`).
+        heights: For 2-D maps and bags: lowest and highest metres above the floor that a robot occupies (see
+            `projection.project`).
         inflate: For 2-D maps: robot radius in metres by which obstacles grow (see `projection.inflated_grid`).
+        floor: For 2-D maps and bags: height in metres of a level floor, from the world's origin; None: it is found.
+        start: For 2-D maps and bags: (3,) metres, near the floor that counts, of several.
 
     Raises:
-        StereovoxError: Unknown ending, unwritable place, cells that the format cannot hold, or `heights` or `inflate`
-            where they have no meaning.
+        StereovoxError: Unknown ending, unwritable place, cells that the format cannot hold, no floor, or an option
+            that has no meaning for this format.
     """
     ending = Path(path).suffix.lower()
     known = registry.names("export", EXPORTS)
     if ending not in known:
         raise StereovoxError(f"{path}: cannot export to '{ending}'; end the file's name with one of {', '.join(known)}")
-    if heights is not None and ending not in (*FLAT, *BAGS):
-        known = " or ".join((*FLAT, *BAGS))
-        raise StereovoxError(f"{path}: heights are for 2-D maps alone; end the file's name with {known}")
+    of_floor = {"heights": heights, "floor": floor, "start": start}
+    for name, value in of_floor.items():
+        if value is not None and ending not in (*FLAT, *BAGS):
+            known = " or ".join((*FLAT, *BAGS))
+            raise StereovoxError(f"{path}: {name} is for 2-D maps alone; end the file's name with {known}")
     if inflate is not None and ending not in FLAT:
         raise StereovoxError(f"{path}: only 2-D maps are inflated; end the file's name with {' or '.join(FLAT)}")
-    options = {"heights": heights, "inflate": inflate}
+    options = {**of_floor, "inflate": inflate}
     given = {name: value for name, value in options.items() if value is not None}
     write = registry.find("export", EXPORTS, ending)
     write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, **given)

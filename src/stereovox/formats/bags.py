@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
 from stereovox.formats.clouds import PointFile, map_of_cloud
@@ -35,11 +36,18 @@ MapT = TypeVar("MapT")
 
 
 @one_state
-def write_bag(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
+def write_bag(
+    voxel_map: VoxelMap,
+    path: str | Path,
+    heights: Heights | None = None,
+    floor: float | None = None,
+    start: ArrayLike | None = None,
+) -> None:
     """Write the map into a bag of its own, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), all latched.
 
     `/octomap_full`: an Octomap of every known cell with its log-odds. `/occupied_cells`: a PointCloud2 of the centres
-    of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights: see `projection.project`.
+    of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights, floor and start: see
+    `projection.project`.
     All are in frame `map`; where the map's `up` is not z, the first two are in `map_cells`, which `/tf_static` turns.
     Stamps are the last frame's, or zero. Raises MapFileError for what cannot be written, MissingExtra
     without rosbags.
@@ -49,7 +57,7 @@ def write_bag(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = N
     stamp_ns = 0 if voxel_map.viewpoint is None else voxel_map.viewpoint.stamp_ns
     frame = CELLS_FRAME if turned else MAP_FRAME
     try:
-        grid, tree = project(voxel_map, heights), full_tree(voxel_map).data
+        grid, tree = project(voxel_map, heights, floor, start), full_tree(voxel_map).data
         with BagWriter(path) as bag:
             if turned:
                 T_map_cells = np.eye(4)

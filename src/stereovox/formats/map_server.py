@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import MapFileError, StereovoxError, did_you_mean
 from stereovox.maps import VoxelMap
@@ -103,15 +103,21 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
 
 
 def write_grid(
-    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+    voxel_map: VoxelMap,
+    path: str | Path,
+    heights: Heights | None = None,
+    inflate: float | None = None,
+    floor: float | None = None,
+    start: ArrayLike | None = None,
 ) -> None:
     """Write the map seen from above as map_server's two files, an image and its .yaml; `path` names either.
 
-    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    heights, floor, start: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a
+    margin of one cell.
     Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
     """
     try:
-        grid = project(voxel_map, heights)
+        grid = project(voxel_map, heights, floor, start)
         grid = grid if inflate is None else inflated_grid(grid, inflate)
     except StereovoxError as error:
         raise StereovoxError(f"{path}: {error}") from None

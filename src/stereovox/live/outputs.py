@@ -62,7 +62,7 @@ class GridFile:
         file: `.yaml`, `.pgm` or `.png`.
         heights: As for `project`.
         period_s: Seconds between two writes.
-        notify: Called with a line where the files could not be written.
+        notify: Called with a line if the files could not be written, and once if the map shows no floor.
 
     Attributes:
         written: How often they were.
@@ -81,7 +81,8 @@ class GridFile:
         notify: Callable[[str], None] = lambda line: None,
     ):
         self._file = check_file(file, FLOOR_ENDINGS)
-        self._projection, self._period_s, self._notify = LiveProjection(mapper.map, heights), period_s, notify
+        self._projection = LiveProjection(mapper.map, heights, notify=lambda line: notify(f"{file}: {line}"))
+        self._period_s, self._notify = period_s, notify
         self._worker = ThreadPoolExecutor(1, "stereovox-grid")
         self._busy: Future[None] | None = None
         self._mapper, self._stale = mapper, False

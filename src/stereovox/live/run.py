@@ -111,7 +111,7 @@ def map_live(
         wait_s: Seconds that an image waits for its pose.
         seconds: How long to map.
         grid: 2-D map to keep up to date (`.yaml`).
-        heights: Lowest and highest metres in which obstacles mark it.
+        heights: Lowest and highest metres above the floor that a robot occupies, for that map.
         sphere: Picture of the distances all round to draw at the end (`.png`).
         record: Recording to write beside (`.mcap`, `.bag` or `.db3`).
         view: Port of a page that shows the map while it grows; 0: any free port. None: no page.

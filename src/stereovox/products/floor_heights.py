@@ -22,6 +22,8 @@ from stereovox.threads import one_state
 
 REACH = 0.5
 """Metres from the nearest floor that was seen, within which its height holds."""
+NO_FLOOR = "the map shows no floor, so heights above it are unknown and nothing is free"
+CURE = "let the camera see the floor, or state its height in the world: --set scan.floor=Z (export: --floor Z), metres"
 TIE = 1e-4
 """Cells: lengths that are so near to whole cells are."""
 SMOOTHED = 5
@@ -158,6 +160,25 @@ class FloorHeights:
         inside = tuple(np.clip(at, 0, n - 1) for at, n in zip((rows, columns), self.height.shape, strict=True))
         outside = np.hypot(rows - inside[0], columns - inside[1]) * self.resolution
         return self.height[inside].astype(float), self.away[inside] + outside
+
+
+def floor_of_map(voxel_map: VoxelMap, stated: float | None = None, start: ArrayLike | None = None) -> FloorHeights:
+    """Return the floor of a map: the level one that is stated, or that `scan.floor` states, or else what is found.
+
+    Args:
+        voxel_map: The map.
+        stated: Metres along the map's `up` from the world's origin; None: `scan.floor`.
+        start: See `find_floor`; with it the floor is found.
+
+    Raises:
+        StereovoxError: The floor is known nowhere, or as `find_floor`.
+    """
+    config = voxel_map.config
+    stated = config.scan.floor if stated is None and start is None else stated
+    floor = find_floor(voxel_map, start) if stated is None else FloorHeights.level(stated, config.up)
+    if not floor.known:
+        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
+    return floor
 
 
 @one_state

@@ -18,6 +18,7 @@ from stereovox.maps.cell_format import CellRules
 from stereovox.maps.queries import points_of
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.floor_axes import Heights, checked_heights, heights_of
+from stereovox.products.floor_heights import floor_of_map
 from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
 from stereovox.products.side_by_side import in_memory
 from stereovox.safe_io import replacing
@@ -55,6 +56,7 @@ def frontiers(
     heights: Heights | None = None,
     start: ArrayLike | None = None,
     radius: float = 0.25,
+    floor: float | None = None,
 ) -> list[Frontier]:
     """Find the frontiers of a map.
 
@@ -66,17 +68,19 @@ def frontiers(
         voxel_map: The map.
         smallest: Fewest cells of a frontier, before it is halved.
         longest: Largest extent in metres.
-        heights: Lowest and highest metres along the map's `up` for cell centres; None for all.
+        heights: Lowest and highest metres above the floor for cell centres; None for all.
         start: (3,) metres, where the robot is; None: the camera of the last frame. The robot reaches the free cells
             that are connected, face by face, with the one nearest to it; with neither, it is in the largest connected
             part.
         radius: Metres about the robot's centre that must be free.
+        floor: Metres along the map's `up` of a level floor, from which `heights` are measured; None: as `scan.floor`
+            states, or else it is found at each place.
 
     Returns:
         The frontiers, largest first.
 
     Raises:
-        StereovoxError: Values that make no sense.
+        StereovoxError: Values that make no sense, or heights in a map that shows no floor.
     """
     from scipy.spatial import KDTree
 
@@ -87,7 +91,9 @@ def frontiers(
     cells = free[at_unknown]
     if heights is not None:
         low, high = checked_heights(heights)
-        height = heights_of(voxel_map.centers(cells), voxel_map.config.up)
+        centres = voxel_map.centers(cells)
+        above = floor_of_map(voxel_map, floor).at(centres, reach=np.inf)
+        height = heights_of(centres, voxel_map.config.up) - above
         cells = cells[(height > low) & (height <= high)]
     reached = KDTree(_reached(voxel_map, free, start, radius))
     groups = [part for group in _groups(cells) if len(group) >= smallest for part in _parts(voxel_map, group, longest)]

@@ -19,8 +19,8 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.floor_axes import Heights, check_level, checked_heights, floor_axes
-from stereovox.products.floor_heights import FloorHeights, find_floor
-from stereovox.products.projection import CURE, NO_FLOOR, patch_of, shown_percent
+from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, find_floor
+from stereovox.products.projection import patch_of, shown_percent
 
 STEP = 8 * SIDE
 """The grid grows by this many cells, so that planners need not reallocate with each frame."""
@@ -47,7 +47,8 @@ class LiveProjection:
     Args:
         voxel_map: The map.
         heights: As for `project`.
-        floor: Metres along the map's `up` of a floor that is stated to be level; None: it is found.
+        floor: Metres along the map's `up` of a floor that is stated to be level; None: as `scan.floor` states, or else
+            it is found.
         floor_s: Seconds between two searches for the floor.
         notify: Called once with a line, if the map goes on without a floor.
         clock: Monotonic seconds.
@@ -71,6 +72,7 @@ class LiveProjection:
         across, along, _ = self._order
         if config.cell[across] != config.cell[along]:
             raise StereovoxError(f"steps {list(config.cell)}: a grid of the floor needs cells as long as wide")
+        floor = config.scan.floor if floor is None else floor
         self._heights = checked_heights(heights or config.scan.heights)
         self._floor = FloorHeights.unknown(config.up) if floor is None else FloorHeights.level(floor, config.up)
         self._floor_s, self._notify, self._clock = floor_s, notify, clock

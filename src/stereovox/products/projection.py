@@ -22,7 +22,7 @@ from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.products import _projection
 from stereovox.products.floor_axes import MAX_CELLS, Heights, check_level, checked_heights, floor_axes
-from stereovox.products.floor_heights import FloorHeights, find_floor
+from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, floor_of_map
 from stereovox.products.transform import transformed
 from stereovox.threads import one_state
 
@@ -34,8 +34,6 @@ INFLATE_TIE = 1e-6
 EMPTY = np.iinfo(np.int16).min
 """Stored value of a column in which nothing is known; no cell is stored as this."""
 NEVER = -1
-NO_FLOOR = "the map shows no floor, so heights above it are unknown and nothing is free"
-CURE = "look at the floor with the camera, or state its height in the world: floor=Z, --floor Z (metres along up)"
 
 
 @one_state
@@ -71,18 +69,26 @@ def project(
             not level.
     """
     check_level(voxel_map.config)
+    heights = checked_heights(heights or voxel_map.config.scan.heights)
+    if not isinstance(floor, FloorHeights):
+        floor = floor_of_map(voxel_map, floor, start)
+    elif not floor.known:
+        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
+    grid = from_above(voxel_map, heights, floor)
+    if grid is None:
+        raise StereovoxError(f"nothing is known {heights[0]:g} to {heights[1]:g} m above the floor; give other heights")
+    return grid
+
+
+def from_above(voxel_map: VoxelMap, heights: Heights, floor: FloorHeights) -> OccupancyGrid | None:
+    """Return the map seen from above, as `project`, of any `up`; None if nothing is known within the heights."""
     order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
-    heights = checked_heights(heights or voxel_map.config.scan.heights)
-    if not isinstance(floor, FloorHeights):
-        floor = find_floor(voxel_map, start) if floor is None else FloorHeights.level(floor, voxel_map.config.up)
-    if not floor.known:
-        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
     slabs = (slab for slab in voxel_map.storage.slabs() if len(slab[0]))
     patch = _joined([patch_of(voxel_map, *slab, order, floor, heights) for slab in slabs])
     if patch is None or not (patch.marked != EMPTY).any():
-        raise StereovoxError(f"nothing is known {heights[0]:g} to {heights[1]:g} m above the floor; give other heights")
+        return None
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 

@@ -33,8 +33,8 @@ PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]
 class Mapping:
     """A 3-D map or a floor map, as the settings say, and its 2-D projection.
 
-    heights: range in metres in which obstacles mark the 2-D map of a 3-D map. tiles: folder for cells outside the
-    window.
+    heights: metres above the floor that a robot occupies, for the 2-D map of a 3-D map. tiles: folder for cells outside
+    the window. notify: called once with a line, if a map in space shows no floor.
 
     Attributes:
         mapper: The current mapper; `load` and `reset` replace it.
@@ -43,8 +43,14 @@ class Mapping:
 
     mapper: AnyMapper[Any]  # the node offers it only what its options allow
 
-    def __init__(self, config: Config, heights: Heights | None = None, tiles: Path | None = None):
-        self._heights, self._tiles = heights, tiles
+    def __init__(
+        self,
+        config: Config,
+        heights: Heights | None = None,
+        tiles: Path | None = None,
+        notify: Callable[[str], None] = lambda line: None,
+    ):
+        self._heights, self._tiles, self._notify = heights, tiles, notify
         self._stamp_clock: StampsBy = None
         self.corrections: Background[CorrectionReport] = Background("stereovox-corrections")
         self._begin(config)
@@ -129,7 +135,7 @@ class Mapping:
 
     def _begin_space(self, config: Config, saved: VoxelMap | None = None) -> None:
         mapper = Mapper(config, resume=saved, tiles=self._tiles, stamp_clock=self._stamp_clock)
-        self.mapper, self._above = mapper, LiveProjection(mapper.map, self._heights).grid
+        self.mapper, self._above = mapper, LiveProjection(mapper.map, self._heights, notify=self._notify).grid
 
     def _begin_floor(self, config: Config, saved: OccupancyGrid | None = None) -> None:
         mapper = GridMapper(config, resume=saved, stamp_clock=self._stamp_clock)

@@ -53,7 +53,7 @@ class Options:
     map_rate, cloud_rate, obstacle_rate: largest rate in messages a second: of the 2-D map, of the cloud and the
     OctoMap, and of obstacles and free rays. obstacle_range: metres round the robot in which those are; blind_m: metres
     up to which unknown cells do not end a free ray.
-    low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
+    low, high: metres above the floor that the robot occupies, for the 2-D map; NaN: those of the settings.
     full_octomap: publish log-odds, not only occupied and free.
     lidar_sigma: standard deviation of the ranges of clouds and scans in metres. lidar_min, lidar_max: metres below
     which their points are left out, and beyond which they are no surfaces (0: no limit).
@@ -127,7 +127,7 @@ class Options:
 
     @property
     def heights(self) -> tuple[float, float] | None:
-        """Heights in metres between which obstacles mark the 2-D map; None: those of the settings."""
+        """Metres above the floor that the robot occupies, for the 2-D map; None: those of the settings."""
         return None if math.isnan(self.low) else (self.low, self.high)
 
     @property

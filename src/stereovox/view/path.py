@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.products.floor_axes import floor_axes
+from stereovox.products.floor_heights import FloorHeights
 from stereovox.products.path_check import point_along
-from stereovox.products.projection import project
+from stereovox.products.projection import from_above
 from stereovox.view.drawn import UPS, turned
 from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.grid import bounds, framed, legend, plan, trimmed
@@ -43,7 +43,7 @@ def picture_path(
     First the map from above, at the heights that the ball passes through; then the vertical section along the path,
     which shows what it passes over and under; then the distance of obstacles and unknown cells.
     blocked_at: metres along the path where it is blocked; this point is marked.
-    Raises StereovoxError where nothing is known at these heights, and as `figures.save`.
+    In the first, a column is free if all of it at these heights is known to be free. Raises as `figures.save`.
     """
     save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title, blocked_at), path)
 
@@ -56,14 +56,14 @@ def draw_path(
     heights = turned(waypoints, up)[:, 2]
     room = max(radius, voxel_map.config.cell[UPS[up][2]])
     band = float(heights.min()) - room, float(heights.max()) + room
-    plan_grid, flat = _projected(voxel_map, band), waypoints[:, UPS[up][:2]]
+    plan_grid, flat = _plan(voxel_map, band, waypoints), waypoints[:, UPS[up][:2]]
     box = bounds(plan_grid, flat)
-    assert box is not None  # `project` found something
+    assert box is not None  # it has a path
     (x0, y0), (x1, y1) = box
     tall = float(np.clip(0.92 * WIDTH * (y1 - y0) / (x1 - x0), 3, 12))
     figure = figure_of(tall + 7.6)
     above, aside, along = figure.subplots(3, 1, height_ratios=[tall, 3, 3])
-    plan(above, trimmed(plan_grid), flat)
+    plan(above, trimmed(plan_grid) if (plan_grid.cells != UNKNOWN).any() else plan_grid, flat)
     names = "".join("xyz"[axis] for axis in UPS[up])
     measured(above, (names[0], names[1], names[2]))
     framed(above, box)
@@ -84,11 +84,15 @@ def draw_path(
     return figure
 
 
-def _projected(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
-    try:
-        return project(voxel_map, band)
-    except StereovoxError as error:  # its cure, other heights, does not apply: they are the path's
-        raise StereovoxError(f"no picture of this path: {str(error).partition(';')[0]}") from None
+def _plan(voxel_map: VoxelMap, band: tuple[float, float], waypoints: NDArray[np.float64]) -> OccupancyGrid:
+    """Return the map from above between two heights of its frame, however it is tilted; unknown if nothing is known."""
+    side = voxel_map.config.cell[UPS[voxel_map.config.up][2]]
+    below = FloorHeights.level(band[0] - side, voxel_map.config.up)  # the cell of a floor itself does not count
+    found = from_above(voxel_map, (side, band[1] - band[0] + side), below)
+    if found is not None:
+        return found
+    x, y = waypoints[0, UPS[voxel_map.config.up][:2]].tolist()
+    return OccupancyGrid(np.full((1, 1), UNKNOWN, np.int8), voxel_map.voxel_size, (x, y, 0.0))
 
 
 def _mark(above: Any, others: tuple[Any, ...], place: NDArray[np.float64], at: float) -> None:

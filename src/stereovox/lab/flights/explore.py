@@ -129,7 +129,12 @@ class Frontiers:
         self._rounds = self._rounds or [ways.start]  # where it began it turned once
         height = ways.start[2]
         found = frontiers(
-            voxel_map, self._smallest, heights=(height - self._band, height + self._band), start=ways.start, radius=0.2
+            voxel_map,
+            self._smallest,
+            heights=(0.0, 2 * self._band),
+            floor=height - self._band,
+            start=ways.start,
+            radius=0.2,
         )
         if self._looks:  # the last was looked at only where it came to the end of the way
             place, end, _ = self._looks[-1]

@@ -108,4 +108,4 @@ def make(makes: Makes, variants: Sequence[Variant], step: Callable[[], None]) ->
 def _grid(mapper: Mapper | GridMapper, variant: Variant) -> OccupancyGrid:
     if isinstance(mapper, GridMapper):
         return mapper.occupancy()
-    return project(mapper.map, variant.config.scan.heights)
+    return project(mapper.map, variant.config.scan.heights, floor=0.0)

@@ -115,8 +115,8 @@ def test_heights_are_along_up(up):
     voxel_map = random_map(6, up=up)
     axis, sign = "xyz".index(up[-1]), -1 if up.startswith("-") else 1
     everywhere = np.concatenate([one.cells for one in frontiers(voxel_map, 1)])
-    within = np.concatenate([one.cells for one in frontiers(voxel_map, 1, heights=(0.2, 0.6))])
-    height = sign * (everywhere[:, axis] + 0.5) * 0.1
+    within = np.concatenate([one.cells for one in frontiers(voxel_map, 1, heights=(0.2, 0.6), floor=-0.3)])
+    height = sign * (everywhere[:, axis] + 0.5) * 0.1 + 0.3
     wanted = everywhere[(height > 0.2) & (height <= 0.6)]
     assert set(map(tuple, within.tolist())) == set(map(tuple, wanted.tolist()))
 
@@ -142,3 +142,18 @@ def test_nothing_and_nonsense():
     far = VoxelMap.from_cells(load_config(), [(-(2**29),) * 3, (2**29,) * 3], [FREE, FREE])
     with pytest.raises(StereovoxError, match="crop"):
         frontiers(far, 1)
+
+
+def test_heights_are_measured_above_the_floor_at_each_place():
+    """A ramp below the world's origin: the band follows it; without a floor it is refused."""
+    cells, values = [], []
+    for x in range(30):
+        level = x // 3 - 25
+        cells += [(x, y, level + above) for y in range(12) for above in range(21)]
+        values += [3.0 if above == 0 else FREE for _ in range(12) for above in range(21)]
+    ramp = VoxelMap.from_cells(load_config(voxel_size=0.1), cells, values)
+    found = np.concatenate([one.cells for one in frontiers(ramp, 1, heights=(0.45, 0.85))])
+    above = found[:, 2] - (found[:, 0] // 3 - 25)
+    assert set(above.tolist()) == {5, 6, 7, 8}
+    with pytest.raises(StereovoxError, match="shows no floor"):
+        frontiers(random_map(6), 1, heights=(0.2, 0.6))

@@ -11,10 +11,12 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
+from stereovox.maps import State
 from stereovox.maps.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
 from stereovox.products.live_projection import STEP, LiveProjection
 from stereovox.products.projection import project
+from stereovox.simulate.simulation import Simulation
 
 CAMERA = PinholeCamera.from_field_of_view(24, 18, 80.0)
 
@@ -46,14 +48,14 @@ def assert_same(shown, expected):
     [
         {},
         {"map.cell": "uint8"},
-        {"map.cell": "int8", "up": "-z", "scan.heights": (-1.8, -0.1)},
+        {"map.cell": "int8", "up": "-z", "scan.floor": -1.9},
         {"window.size": (6.0, 6.0, 4.0), "window.trigger": 0.2},
         {"map.keep_times": True, "map.forget_s": 2.5},
         {"steps": (0.2, 0.2, 0.1)},
     ],
 )
 def test_after_every_frame_it_is_the_map_from_above(settings):
-    mapper = Mapper("default", **{"voxel_size": 0.2, "max_range": 3.0, **settings})
+    mapper = Mapper("default", **{"voxel_size": 0.2, "max_range": 3.0, "scan.floor": 0.0, **settings})
     live = LiveProjection(mapper.map)
     assert live.grid() is None
     for k, frame in enumerate(frames(7, seed=1)):
@@ -63,8 +65,59 @@ def test_after_every_frame_it_is_the_map_from_above(settings):
     assert (np.array(live.grid().cells.shape) % STEP == 0).all()
 
 
+def room_below_the_origin(number: int):
+    """A furnished room whose floor lies 1.3 m below where the camera began."""
+    simulation = Simulation("sim:room?image_width=96", frames=120)
+    start = simulation.true_pose(0)[:3, 3]
+    for k in range(number):
+        T = simulation.true_pose(k).copy()
+        T[:3, 3] -= start
+        yield replace(simulation.frame(k), T_world_sensor=T)
+
+
+def test_a_floor_that_is_found_moves_with_the_map():
+    mapper = Mapper("default", voxel_size=0.1)
+    live, free = LiveProjection(mapper.map, floor_s=0.0, clock=lambda: 0.0), []
+    for k, frame in enumerate(room_below_the_origin(12)):
+        mapper.add(frame)
+        if k in (4, 7, 11):
+            grid = live.grid()
+            assert_same(grid, project(mapper.map))
+            free.append(np.count_nonzero(grid.states == State.FREE))
+            assert live.floor.height.min() == pytest.approx(-1.3, abs=0.11)
+    assert free[-1] > free[0] > 0
+
+
+def test_between_two_searches_the_floor_stays_and_new_places_wait():
+    now = [0.0]
+    mapper = Mapper("default", voxel_size=0.1)
+    live = LiveProjection(mapper.map, floor_s=1.0, clock=lambda: now[0])
+    frames = room_below_the_origin(8)
+    for _ in range(4):
+        mapper.add(next(frames))
+    live.grid()
+    floor = live.floor
+    mapper.add(next(frames))
+    live.grid()
+    assert live.floor is floor
+    now[0] = 1.5
+    assert_same(live.grid(), project(mapper.map))
+    assert live.floor is not floor
+
+
+def test_without_a_floor_nothing_is_free_and_it_is_told_once():
+    mapper, lines = Mapper("default", voxel_size=0.2, max_range=3.0), []
+    live = LiveProjection(mapper.map, notify=lines.append, floor_s=0.0, clock=lambda: 0.0)
+    for frame in frames(8, seed=5):
+        mapper.add(frame)
+        grid = live.grid()
+        assert (grid.states == State.UNKNOWN).all()
+    assert len(lines) == 1
+    assert "scan.floor" in lines[0]
+
+
 def test_it_looks_at_what_changed_alone(monkeypatch):
-    mapper = Mapper("default", voxel_size=0.2, max_range=3.0)
+    mapper = Mapper("default", voxel_size=0.2, max_range=3.0, **{"scan.floor": 0.0})
     live, looked = LiveProjection(mapper.map), []
     within = Storage.blocks_within
     monkeypatch.setattr(Storage, "blocks_within", lambda *a: looked.append(within(*a)) or looked[-1])
@@ -78,7 +131,7 @@ def test_it_looks_at_what_changed_alone(monkeypatch):
 
 def test_cells_that_were_handed_out_do_not_change():
     mapper = Mapper("default", voxel_size=0.2)
-    live = LiveProjection(mapper.map)
+    live = LiveProjection(mapper.map, floor=0.0)
     first, second, *_ = frames(3, seed=3)
     mapper.add(first)
     before = live.grid()
@@ -97,7 +150,7 @@ def test_heights_and_steps_that_cannot_be_are_told():
 
 def test_a_grid_that_were_too_large_is_told_and_the_map_goes_on():
     mapper = Mapper("default", voxel_size=0.2, **{"trust.ordered": False})
-    live = LiveProjection(mapper.map)
+    live = LiveProjection(mapper.map, floor=0.0)
     near = next(frames(1, seed=4))
     mapper.add(near)
     shown = live.grid()

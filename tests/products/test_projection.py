@@ -43,29 +43,33 @@ def percent(log_odds):
 
 def random_map(config, seed=0):
     random = np.random.default_rng(seed)
-    indices = np.unique(random.integers([-13, -9, -20], [12, 30, 21], (3000, 3)), axis=0)
+    indices = np.unique(random.integers([-13, -9, -20], [12, 30, 21], (20000, 3)), axis=0)
     return VoxelMap.from_cells(config, indices, random.choice([-4, -2.5, -0.2, 0.3, 1.2, 3.5], len(indices)))
 
 
-def slow(voxel_map, heights):
-    """{(column, row): (probability, state)} of all columns of which something is known."""
+def slow(voxel_map, heights, floor):
+    """{(column, row): (probability, state)} of all columns of which something is known in the band above a floor."""
     up = voxel_map.config.up
     x, y, z = ("xyz".index(axis) for axis in AXES[up])
+    side = voxel_map.config.cell[z]
+    band = [k for k in range(-200, 200) if k > np.floor(floor / side + 1e-6)
+            and (k + 1) * side > floor + heights[0] + 1e-6 and k * side < floor + heights[1] - 1e-6]  # fmt: skip
     cells, log_odds = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(cells))
-    within, free = {}, {}
+    within = {}
     for cell, value, what in zip(cells.tolist(), log_odds.tolist(), state.tolist(), strict=True):
-        height = (cell[z] + 0.5) * voxel_map.config.cell[z] * (-1 if up.startswith("-") else 1)
-        place = cell[x], cell[y]
-        if heights[0] + 1e-6 < height <= heights[1] + 1e-6:
-            within[place] = max(within.get(place, (-9, 0)), (value, what))
-        if what == State.FREE:
-            free[place] = max(free.get(place, (-9, 0)), (value, what))
-    return {place: within.get(place) or free[place] for place in {*within, *free}}
+        if (-1 - cell[z] if up.startswith("-") else cell[z]) in band:
+            within.setdefault((cell[x], cell[y]), []).append((value, what))
+    found = {place: (*max(column), len(column)) for place, column in within.items()}
+    return {
+        place: (value, state)
+        for place, (value, state, number) in found.items()
+        if state != State.FREE or number == len(band)
+    }
 
 
-def compare(grid, voxel_map, heights):
-    wanted = slow(voxel_map, heights)
+def compare(grid, voxel_map, heights, floor=0.0):
+    wanted = slow(voxel_map, heights, floor)
     x, y, _ = ("xyz".index(axis) for axis in AXES[voxel_map.config.up])
     low, high = np.min(list(wanted), axis=0), np.max(list(wanted), axis=0)
     assert grid.cells.shape == (high[1] - low[1] + 1, high[0] - low[0] + 1)
@@ -83,21 +87,23 @@ def compare(grid, voxel_map, heights):
 
 
 @pytest.mark.parametrize("up", AXES)
-@pytest.mark.parametrize("heights", [(0.1, 1.0), (-1.25, -0.35)])
-def test_equals_the_slow_one(up, heights):
+@pytest.mark.parametrize(("heights", "floor"), [((0.1, 1.0), 0.0), ((0.15, 0.25), -1.0), ((0.0, 0.2), 0.45)])
+def test_equals_the_slow_one(up, heights, floor):
     voxel_map = random_map(settings(up=up))
-    compare(project(voxel_map, heights), voxel_map, heights)
+    grid = project(voxel_map, heights, floor)
+    compare(grid, voxel_map, heights, floor)
+    assert (grid.states == State.FREE).any() == (heights[1] < 0.5)  # few columns are known so high up
 
 
 @pytest.mark.parametrize("more", [{"map.cell": "uint8"}, {"map.prior": 0.05}, {"steps": [0.1, 0.1, 0.25]}])
 def test_other_cells_equal_the_slow_ones(more):
     voxel_map = random_map(settings(**more), seed=1)
-    compare(project(voxel_map), voxel_map, (0.1, 1.0))
+    compare(project(voxel_map, floor=0.0), voxel_map, (0.1, 1.0))
 
 
 def test_uneven_cells_are_made_cubes():
     voxel_map = random_map(settings(steps=[0.1, 0.2, 0.1]))
-    compare(project(voxel_map), in_cubes(voxel_map), (0.1, 1.0))
+    compare(project(voxel_map, floor=0.0), in_cubes(voxel_map), (0.1, 1.0))
 
 
 class InPieces(Storage):
@@ -113,34 +119,36 @@ class InPieces(Storage):
 def test_a_map_that_comes_in_pieces_is_seen_whole(up):
     whole, pieces = random_map(settings(up=up)), VoxelMap(settings(up=up), storage=InPieces(settings(up=up)))
     pieces.storage.insert(*whole.storage.blocks())
-    compare(project(pieces), whole, (0.1, 1.0))
+    compare(project(pieces, floor=0.0), whole, (0.1, 1.0))
+
+
+OPEN = {0.05 + 0.1 * k: FREE for k in range(1, 10)}
+"""All of the band above a floor at 0 is free."""
 
 
 @pytest.mark.parametrize(
     ("cells", "wanted", "state"),
     [
-        ({0.55: FREE}, percent(FREE), State.FREE),
-        ({0.55: WALL, 0.65: FREE}, percent(WALL), State.OCCUPIED),
-        ({0.55: PERHAPS, 0.65: FREE}, percent(PERHAPS), State.TENTATIVE),
-        ({0.05: WALL, 0.55: FREE}, percent(FREE), State.FREE),  # the floor marks nothing
-        ({0.55: FREE, 1.85: WALL}, percent(FREE), State.FREE),  # nor does the ceiling
-        ({0.05: WALL, 1.85: WALL}, -1, State.UNKNOWN),
-        ({0.05: PERHAPS}, -1, State.UNKNOWN),
-        ({1.45: FREE}, percent(FREE), State.FREE),  # what is free at another height clears
-        ({-0.55: FREE, 1.45: -2.0}, percent(-2.0), State.FREE),
-        ({0.55: WALL, 1.45: FREE}, percent(WALL), State.OCCUPIED),  # but not what is marked
-        ({0.55: PERHAPS, 1.45: FREE}, percent(PERHAPS), State.TENTATIVE),
-        ({0.15: WALL}, percent(WALL), State.OCCUPIED),  # the lowest and the highest layer that count
-        ({0.95: WALL}, percent(WALL), State.OCCUPIED),
-        ({1.05: WALL}, -1, State.UNKNOWN),
+        (OPEN, percent(FREE), State.FREE),
+        ({**OPEN, 0.55: WALL}, percent(WALL), State.OCCUPIED),
+        ({**OPEN, 0.55: PERHAPS}, percent(PERHAPS), State.TENTATIVE),
+        ({**OPEN, 0.05: WALL, 1.05: WALL}, percent(FREE), State.FREE),  # floor and ceiling mark nothing
+        ({**OPEN, 0.15: WALL}, percent(WALL), State.OCCUPIED),  # the lowest and the highest layer that count
+        ({**OPEN, 0.95: WALL}, percent(WALL), State.OCCUPIED),
+        (dict.fromkeys(list(OPEN)[1:], FREE), -1, State.UNKNOWN),  # a low box may stand there
+        (dict.fromkeys(list(OPEN)[:-1], FREE), -1, State.UNKNOWN),  # a lamp may hang there
+        ({0.05: WALL, 1.05: FREE, -0.55: FREE}, -1, State.UNKNOWN),  # what is free elsewhere clears nothing
+        ({0.55: WALL}, percent(WALL), State.OCCUPIED),
+        ({0.55: PERHAPS}, percent(PERHAPS), State.TENTATIVE),
     ],
 )
 def test_a_column(cells, wanted, state):
-    grid = project(column(cells))
+    grid = project(column(cells), floor=0.0)
     assert grid.states[0, -1] == State.OCCUPIED
-    assert grid.cells.shape == (1, 1 if wanted == -1 else 2)  # what is unknown at the border is no part of the grid
+    here = grid.cells[0, 0] if grid.cells.shape[1] == 2 else -1  # what is unknown at the border is no part of the grid
+    assert here == wanted
     if wanted != -1:
-        assert (grid.cells[0, 0], grid.states[0, 0]) == (wanted, state)
+        assert grid.states[0, 0] == state
 
 
 def test_heights_that_cannot_be():
@@ -149,53 +157,72 @@ def test_heights_that_cannot_be():
         (0.5, 0.5): "rise",
         (1.0, 0.5): "rise",
         (0.1, np.inf): "rise",
-        (0.56, 0.6): "widen",
-        (3.0, 4.0): "0.50 to 0.60 m; choose others",
+        (-0.5, 1.0): "0 or more",
     }.items():
         with pytest.raises(StereovoxError, match=words) as error:
-            project(voxel_map, heights)
+            project(voxel_map, heights, 0.0)
         assert "\n" not in str(error.value)
-    with pytest.raises(StereovoxError, match="empty"):
-        project(VoxelMap(settings()))
-    with pytest.raises(StereovoxError, match=r"-0\.60 to -0\.50 m"):
-        project(VoxelMap.from_cells(settings(up="-z"), [(0, 0, 5)], [WALL]))
+    with pytest.raises(StereovoxError, match="3 to 4 m above the floor no place"):
+        project(voxel_map, (3.0, 4.0), 0.0)
+    with pytest.raises(StereovoxError, match="floor inf"):
+        project(voxel_map, (0.1, 1.0), np.inf)
+
+
+@pytest.mark.parametrize("cells", [{}, {0.55: FREE}])
+def test_a_map_without_a_floor_is_refused_with_the_cure(cells):
+    voxel_map = column(cells) if cells else VoxelMap(settings())
+    with pytest.raises(StereovoxError, match=r"shows no floor.*scan\.floor"):
+        project(voxel_map)
+    stated = VoxelMap.from_cells(settings(**{"scan.floor": 0.0}), *voxel_map.cells())
+    if cells:
+        np.testing.assert_array_equal(project(stated).cells, project(voxel_map, floor=0.0).cells)
 
 
 def test_a_grid_that_would_be_too_large():
     voxel_map = VoxelMap.from_cells(settings(), [(-(2**20), 0, 5), (2**20, 2**20, 5)], [WALL, WALL])
     with pytest.raises(StereovoxError, match="too large"):
-        project(voxel_map)
+        project(voxel_map, floor=0.0)
 
 
 @pytest.mark.parametrize("name", ["floor.pgm", "floor.png", "floor.yaml"])
 def test_exported_for_map_server(tmp_path, name):
     voxel_map = random_map(settings())
-    export(voxel_map, tmp_path / name, (0.1, 0.6))
-    grid, found = project(voxel_map, (0.1, 0.6)), read_map_server(tmp_path / "floor.yaml")
+    export(voxel_map, tmp_path / name, (0.1, 0.6), floor=-1.0)
+    grid, found = project(voxel_map, (0.1, 0.6), -1.0), read_map_server(tmp_path / "floor.yaml")
     known = np.isin(grid.states, [State.FREE, State.OCCUPIED])
     np.testing.assert_array_equal(found.states[known], grid.states[known])
     assert (found.cells[~known] == -1).all()
     assert found.origin == pytest.approx(grid.origin)
-    assert (project(voxel_map).cells.shape != grid.cells.shape) or (project(voxel_map).cells != grid.cells).any()
+    other = project(voxel_map, floor=-1.0)
+    assert other.cells.shape != grid.cells.shape or (other.cells != grid.cells).any()
 
 
-def test_heights_are_for_grids_alone(tmp_path):
-    with pytest.raises(StereovoxError, match=r"heights.*\.pgm"):
-        export(random_map(settings()), tmp_path / "map.ply", (0.1, 1.0))
+@pytest.mark.parametrize("option", [{"heights": (0.1, 1.0)}, {"floor": 0.0}, {"start": (0, 0, 0)}])
+def test_heights_are_for_grids_alone(tmp_path, option):
+    with pytest.raises(StereovoxError, match=rf"{next(iter(option))} is for 2-D maps.*\.pgm"):
+        export(random_map(settings()), tmp_path / "map.ply", **option)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_command(tmp_path, capsys):
     random_map(settings()).save(tmp_path / "map.svox")
     where = str(tmp_path / "map.svox")
-    assert main(["export", where, str(tmp_path / "a.pgm"), "--json"]) == 0
-    assert '"heights": [0.1, 1.0]' in capsys.readouterr().out
-    assert main(["export", where, str(tmp_path / "b.yaml"), "--heights=-1:-0.5"]) == 0
-    assert "-1 to -0.5 m" in capsys.readouterr().err
+    assert main(["export", where, str(tmp_path / "a.pgm"), "--json", "--floor", "0"]) == 0
+    shown = capsys.readouterr()
+    assert '"heights": [0.1, 1.0]' in shown.out
+    assert "stated to be at 0 m" in shown.err
+    assert main(["export", where, str(tmp_path / "b.yaml"), "--heights=0.2:0.5", "--floor=-1"]) == 0
+    assert "0.2 to 0.5 m above the floor" in capsys.readouterr().err
     first, second = (read_map_server(tmp_path / name) for name in ("a.yaml", "b.yaml"))
     assert first.cells.shape != second.cells.shape or (first.cells != second.cells).any()
-    for heights, words in {"1": "LO:HI", "a:b": "LO:HI", "2:1": "higher", "8:9": "--heights=LO:HI"}.items():
-        assert main(["export", where, str(tmp_path / "c.pgm"), f"--heights={heights}"]) == 2
+    for heights, words in {
+        "1": "LO:HI",
+        "a:b": "LO:HI",
+        "2:1": "higher",
+        "8:9": "other heights",
+        "-1:1": "0 or more",
+    }.items():
+        assert main(["export", where, str(tmp_path / "c.pgm"), f"--heights={heights}", "--floor=0"]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "c.pgm").exists()
 
@@ -208,7 +235,7 @@ def test_a_floor_seen_by_a_kinect():
         T = floor.truth.at(frame.stamp_ns) @ floor.T_base_camera
         assert mapper.add(replace(frame, T_world_sensor=T)).refused in (None, "no_valid_depth")
     heights = (0.1, 1.8)
-    grid = project(mapper.map, heights)
+    grid = project(mapper.map, heights)  # its floor is found
     scores = score_grids(grid, floor.true_grid(0.05, heights, lids=True), align=False)
     assert scores.occupied.tolerance_precision > 0.97
     assert scores.to_reference.p95 <= 0.051

@@ -26,7 +26,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--heights",
         metavar="LO:HI",
-        help="2-D maps and bags: metres above the floor that a robot occupies (the map's scan.heights); free is what was"
+        help="2-D maps and bags: metres above the floor that a robot occupies (scan.heights); free is what was"
         " seen free in all of them",
     )
     parser.add_argument(

@@ -233,8 +233,8 @@ def check_floor(image: DepthImage, turn: NDArray[np.float64], at: float) -> None
     if at <= 0 or share > MOST_DEEP:
         raise FrameRefused(
             "below_floor",
-            f"{name(image)}: the camera is {at:.2f} m above the floor of the settings, and {share:.0%} of what it sees lies"
-            " below that floor; set scan.floor to the floor's height in the world of the poses, in metres",
+            f"{name(image)}: the camera is {at:.2f} m above the floor of the settings, and {share:.0%} of what it sees"
+            " lies below that floor; set scan.floor to the floor's height in the world of the poses, in metres",
         )
 
 

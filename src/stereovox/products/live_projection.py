@@ -76,7 +76,8 @@ class LiveProjection:
         self._heights = checked_heights(heights or config.scan.heights)
         self._floor = FloorHeights.unknown(config.up) if floor is None else FloorHeights.level(floor, config.up)
         self._floor_s, self._notify, self._clock = floor_s, notify, clock
-        self._due, self._tries, self._stated = -np.inf, 0, floor is not None
+        self._due, self._tries, self._seek = -np.inf, 0, floor is None
+        self._stated = floor is not None
         self._percent = Percent(CellRules(config.map))
         self._whole = isinstance(voxel_map, RollingMap) or config.map.forget_s is not None
         self._changed = EVERYWHERE.copy()
@@ -101,8 +102,9 @@ class LiveProjection:
     def _seek_floor(self) -> None:
         """Find the floor if that is due and the map changed, and note where it moved."""
         now = self._clock()
-        if self._stated or now < self._due or (self._changed[0] >= self._changed[1]).any():
+        if self._stated or not self._seek or now < self._due:
             return
+        self._seek = False
         before, self._floor = self._floor, find_floor(self._map)
         self._due = now + max(self._floor_s, SHARE * (self._clock() - now))
         self._tries = 0 if self._floor.known else self._tries + 1
@@ -117,6 +119,7 @@ class LiveProjection:
 
     def _note(self, evidence: Evidence) -> None:
         """Add the columns that a frame changed to those to be projected again."""
+        self._seek = True
         for coords in (evidence.coords, evidence.uniform):
             if len(coords):
                 floor = coords[:, self._order[:2]]

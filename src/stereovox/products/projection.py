@@ -76,7 +76,8 @@ def project(
         raise StereovoxError(f"{NO_FLOOR}; {CURE}")
     grid = from_above(voxel_map, heights, floor)
     if grid is None:
-        raise StereovoxError(f"nothing is known {heights[0]:g} to {heights[1]:g} m above the floor; give other heights")
+        band = f"{heights[0]:g} to {heights[1]:g} m above the floor"
+        raise StereovoxError(f"{band} no place is known to be free or occupied; give other heights")
     return grid
 
 
@@ -87,9 +88,7 @@ def from_above(voxel_map: VoxelMap, heights: Heights, floor: FloorHeights) -> Oc
         voxel_map = in_cubes(voxel_map)
     slabs = (slab for slab in voxel_map.storage.slabs() if len(slab[0]))
     patch = _joined([patch_of(voxel_map, *slab, order, floor, heights) for slab in slabs])
-    if patch is None or not (patch.marked != EMPTY).any():
-        return None
-    return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
+    return None if patch is None else _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
 class Patch(NamedTuple):
@@ -230,10 +229,12 @@ def _joined(patches: list[Patch]) -> Patch | None:
     return joined
 
 
-def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
+def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid | None:
     percent = Percent(CellRules(voxel_map.config.map))
-    cells, known = shown_percent(patch, percent), patch.marked != EMPTY
-    rows, columns = (np.flatnonzero(known.any(axis=across)) for across in (1, 0))
+    cells = shown_percent(patch, percent)
+    rows, columns = (np.flatnonzero((cells != UNKNOWN).any(axis=across)) for across in (1, 0))
+    if not len(rows):
+        return None
     cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).round(9).tolist()
     return OccupancyGrid(cells, side, (left, bottom, 0.0), percent.free_below, percent.occupied_above)

@@ -12,10 +12,9 @@ floor.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,8 @@ from numpy.typing import NDArray
 import stereovox as sv
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.se3 import look_at
-from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.d435 import D435, depth_camera
+from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.scene import Scene, Solid, box, cylinder
 from stereovox.simulate.simulation import Simulation
 
@@ -61,12 +60,13 @@ def furnished(name: str, floor: Height, cuts: list[float], seed: int, eye: float
     """A room of 10 x 6 m whose floor changes along x at `cuts`, with furniture at random, walked through."""
     random = np.random.default_rng(seed)
     solids, ends = [], [0.0, *cuts, 10.0]
-    for left, right in zip(ends[:-1], ends[1:], strict=True):
+    for left, right in pairwise(ends):
         solids.append(_lifted(box("floor", f"floor {left}", (left, 0, -0.3), (right, 6, 0)), floor, left, right))
     tall = float(floor(np.array([0.0, 4.5, 9.9])).max()) + 2.7
     low = float(floor(np.array([0.0, 4.5, 9.9])).min()) - 0.3
     solids += [
-        box("walls", "back", (-0.2, -0.2, low), (0, 6.2, tall)), box("walls", "front", (10, -0.2, low), (10.2, 6.2, tall)),
+        box("walls", "back", (-0.2, -0.2, low), (0, 6.2, tall)),
+        box("walls", "front", (10, -0.2, low), (10.2, 6.2, tall)),
         box("walls", "right", (0, -0.2, low), (10, 0, tall)), box("walls", "left", (0, 6, low), (10, 6.2, tall)),
         box("ceiling", "ceiling", (-0.2, -0.2, tall), (10.2, 6.2, tall + 0.2)),
     ]  # fmt: skip
@@ -74,7 +74,7 @@ def furnished(name: str, floor: Height, cuts: list[float], seed: int, eye: float
     taken: list[tuple[float, float, float]] = []
     for number in range(60):
         x, y = random.uniform([0.4, 0.4], [9.6, 5.6])
-        along = np.concatenate([np.linspace(a, b, 30) for a, b in zip(way[:-1], way[1:], strict=True)])
+        along = np.concatenate([np.linspace(a, b, 30) for a, b in pairwise(way)])
         away = np.hypot(*(along - (x, y)).T).min()
         size = random.uniform(0.15, 0.7)
         clear = all(np.hypot(x - a, y - b) > size + c for a, b, c in taken)
@@ -178,9 +178,10 @@ class Score:
         return Score(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def __str__(self) -> str:
+        wrong, right = self.called_free / max(self.obstacles, 1), self.stays_free / max(self.floor, 1)
         return (
-            f"{self.called_free:6} of {self.obstacles:6} obstacles free ({100 * self.called_free / max(self.obstacles, 1):6.2f} %), "
-            f"{self.stays_free:6} of {self.floor:6} of the floor ({100 * self.stays_free / max(self.floor, 1):5.1f} %)"
+            f"{self.called_free:6} of {self.obstacles:6} obstacles free ({wrong:6.2%}), "
+            f"{self.stays_free:6} of {self.floor:6} of the floor ({right:5.1%})"
         )
 
 

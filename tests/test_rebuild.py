@@ -303,7 +303,7 @@ def test_the_gate_compares_with_the_corrected_poses():
 def test_listeners_hear_what_changed():
     frames = made_frames()
     mapper = mapped(frames)
-    live = LiveProjection(mapper.map, (0.0, 1.0))
+    live = LiveProjection(mapper.map, (0.0, 1.0), floor=0.0)
     live.grid()
     before = dict(zip(map(tuple, mapper.map.storage.blocks()[0].tolist()), mapper.map.storage.blocks()[1], strict=True))
     heard = []
@@ -315,7 +315,7 @@ def test_listeners_hear_what_changed():
     assert changed
     assert changed <= set(map(tuple, evidence.uniform.tolist()))
     assert not evidence.uniform_values.any()
-    grid, new = live.grid(), project(mapper.map, (0.0, 1.0))
+    grid, new = live.grid(), project(mapper.map, (0.0, 1.0), floor=0.0)
     row, column = (round((a - b) / 0.1) for a, b in zip(new.origin[1::-1], grid.origin[1::-1], strict=True))
     shown = grid.cells[row : row + new.cells.shape[0], column : column + new.cells.shape[1]]
     assert np.array_equal(shown, new.cells)
@@ -326,12 +326,12 @@ def test_nothing_is_shown_any_longer_where_nothing_was_seen():
     """Where all frames are moved far, blocks vanish."""
     frames = made_frames()
     mapper = mapped(frames)
-    live = LiveProjection(mapper.map, (0.0, 1.0))
+    live = LiveProjection(mapper.map, (0.0, 1.0), floor=0.0)
     live.grid()
     far = np.eye(4)
     far[:3, 3] = 3.0, 1.0, 0.0
     mapper.correct({f.stamp_ns: far @ f.T_world_sensor for f in frames})
-    grid, new = live.grid(), project(mapper.map, (0.0, 1.0))
+    grid, new = live.grid(), project(mapper.map, (0.0, 1.0), floor=0.0)
     assert np.count_nonzero(grid.cells != -1) == np.count_nonzero(new.cells != -1) > 100
 
 

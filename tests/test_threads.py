@@ -194,7 +194,7 @@ ALONE = {
     "path": lambda m, path: path_check.check_path(m, [[-0.8, 0, 0], [0.5, 0, 0]], 0.2),
     "pcd": lambda m, path: points.write_pcd(m, path / "m.pcd"),
     "ply": lambda m, path: points.write_ply(m, path / "m.ply"),
-    "project": lambda m, path: projection.project(m, (-9, 9)),
+    "project": lambda m, path: projection.project(m, (0, 18), -9.0),
     "rerun": lambda m, path: rerun.write_rrd(m, path / "m.rrd"),
 }
 NEEDS = {"bag": "rosbags", "rerun": "rerun", "ground": "scipy", "mesh": "skimage"}
@@ -213,7 +213,7 @@ def test_what_reads_a_map_in_several_calls_lets_it_not_change_between_them(name,
 
 def test_a_live_projection_misses_no_frame_while_it_looks(monkeypatch):
     mapper = mapped()
-    above, seen = LiveProjection(mapper.map, (-9, 9)), []
+    above, seen = LiveProjection(mapper.map, (0, 18), floor=-9.0), []
     within = Storage.blocks_within
     monkeypatch.setattr(
         Storage, "blocks_within", lambda *words: (within(*words), seen.append(taken(mapper.map.lock)))[0]

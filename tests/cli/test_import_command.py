@@ -58,8 +58,11 @@ def test_a_floor_there_and_back(capsys):
         (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map tells"),
         (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap tells how large its cells are"),
         (["import", "room.svox", "m"], "room.svox"),
-        (["export", "room.svox", "m.bag", "--heights", "90:99"], "m.bag: nothing is known at heights 90 to 99 m"),
-        (["export", "room.svox", "room.ply", "--heights", "0:1"], "heights are for 2-D maps"),
+        (
+            ["export", "room.svox", "m.bag", "--heights", "90:99", "--floor=0"],
+            "m.bag: 90 to 99 m above the floor no place",
+        ),
+        (["export", "room.svox", "room.ply", "--heights", "0:1"], "heights is for 2-D maps"),
         (["export", "floor.yaml", "m.bag", "--heights", "0:1"], "--heights: a floor's map goes into a bag as it is"),
         (["export", "floor.yaml", "m.ply"], "is the map of a floor"),
     ],

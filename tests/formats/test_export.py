@@ -10,7 +10,7 @@ from stereovox.formats import EXPORTS, FLAT, export
 from stereovox.formats.points import PCD_POINT, PLY_POINT
 from stereovox.maps import VoxelMap
 
-CONFIG = load_config(voxel_size=0.25, **{"map.prior": 0.5})
+CONFIG = load_config(voxel_size=0.25, **{"map.prior": 0.5, "scan.floor": -9.0, "scan.heights": (0.1, 18.0)})
 
 
 @pytest.fixture

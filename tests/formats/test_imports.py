@@ -27,7 +27,7 @@ BAGS = (".bag", ".mcap", ".db3")
 def random_map(**settings):
     dice = np.random.default_rng(4)
     indices = np.unique(dice.integers(-12, 12, (600, 3)), axis=0)
-    config = load_config(voxel_size=0.05, **{"scan.heights": (-1, 1), **settings})
+    config = load_config(voxel_size=0.05, **{"scan.heights": (0, 2), "scan.floor": -1.0, **settings})
     return VoxelMap.from_cells(config, indices, dice.uniform(-4, 3.5, len(indices)))
 
 
@@ -241,8 +241,8 @@ def test_an_occupancy_grid_through_a_bag(tmp_path, ending):
 
 def test_a_map_in_a_bag_is_seen_from_above_as_well(tmp_path):
     made = random_map(up="-y")
-    export(made, tmp_path / "map.mcap", (-0.3, 0.3))
-    grid, expected = read_bag_grid(tmp_path / "map.mcap"), project(made, (-0.3, 0.3))
+    export(made, tmp_path / "map.mcap", (0.1, 0.6), floor=-0.3)
+    grid, expected = read_bag_grid(tmp_path / "map.mcap"), project(made, (0.1, 0.6), -0.3)
     np.testing.assert_array_equal(grid.cells, expected.cells)
     cloud = import_map(tmp_path / "map.mcap", voxel_size=0.05, topic="/occupied_cells")
     assert in_state(cloud, State.OCCUPIED) == in_state(made, State.OCCUPIED)
@@ -251,7 +251,7 @@ def test_a_map_in_a_bag_is_seen_from_above_as_well(tmp_path):
 def test_the_cells_stand_in_the_bag_s_map_frame_as_its_grid_does(tmp_path):
     """RViz draws both in `map`: a cell turned there by /tf_static lies in the grid's cell that it marked."""
     made = VoxelMap.from_cells(load_config(voxel_size=0.1, up="-y"), [[3, -8, 5]], [3.0])
-    export(made, tmp_path / "map.mcap")
+    export(made, tmp_path / "map.mcap", floor=0.0)
     bag = open_bag(tmp_path / "map.mcap")
     [told] = read_transforms(bag.read("/tf_static", 0))
     place = Rotation.from_quat(told.numbers[3:]).apply(made.occupied()[0])

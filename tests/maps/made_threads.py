@@ -145,7 +145,10 @@ def check(make, frames, points, load, ask, look=lambda mapper: ({}, lambda: None
 
 def products(mapper):
     """A field of distances that one thread updates and another one asks, and a live view from above."""
-    field, above = DistanceField(mapper.map, (-3, -3, -1), (3, 3, 1), max_distance=1.0), LiveProjection(mapper.map)
+    field, above = (
+        DistanceField(mapper.map, (-3, -3, -1), (3, 3, 1), max_distance=1.0),
+        LiveProjection(mapper.map, floor=-2.0),
+    )
     somewhere = np.random.default_rng(1).uniform(-2, 2, (2000, 3))
     updated, asked = [digest(field.gradient(somewhere))], []
 
@@ -159,13 +162,13 @@ def products(mapper):
         update()
         anew = DistanceField(mapper.map, (-3, -3, -1), (3, 3, 1), max_distance=1.0)
         assert np.array_equal(field.metres, anew.metres)
-        shown, expected = above.grid(), LiveProjection(mapper.map).grid()
+        shown, expected = above.grid(), LiveProjection(mapper.map, floor=-2.0).grid()
         assert np.array_equal(shown.cells, expected.cells)
 
     return {
         "update": update,
         "distance": lambda: asked.append(digest(field.gradient(somewhere))),
-        "project": lambda: mapper.map.frames and project(mapper.map, (-2.0, 2.0)),
+        "project": lambda: mapper.map.frames and project(mapper.map, (0.0, 4.0), floor=-2.0),
     }, at_the_end
 
 

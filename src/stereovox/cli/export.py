@@ -10,11 +10,14 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.maps import dimensions, open_map, refuse_options
 from stereovox.cli.options import heights_of, point
 from stereovox.cli.terminal import say, size
+
+if TYPE_CHECKING:
+    from stereovox.products.floor_heights import FloorHeights
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
 
@@ -49,21 +52,24 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and export it."""
     from stereovox.formats import BAGS, FLAT, export
+    from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, floor_of_map
 
     file, heights = Path(arguments.file), heights_of(arguments.heights)
     ending = file.suffix.lower()
     if dimensions(arguments.map) == 2 and ending in BAGS:
         return _export_floor(arguments)
     voxel_map = open_map(arguments.map)
-    export(voxel_map, file, heights, arguments.inflate, arguments.floor, arguments.start)
+    flat = ending in (*FLAT, *BAGS)
+    floor = floor_of_map(voxel_map, arguments.floor, arguments.start) if flat else arguments.floor
+    export(voxel_map, file, heights, arguments.inflate, floor, None if flat else arguments.start)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
     beside = ""
-    if ending in (*FLAT, *BAGS):
+    if isinstance(floor, FloorHeights) and floor.known:
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
-        stated = voxel_map.config.scan.floor if arguments.floor is None else arguments.floor
-        where = "found at each place" if stated is None or arguments.start else f"stated to be at {stated:g} m"
-        say(f"seen from above: {low:g} to {high:g} m above the floor, which is {where}")
+        say(f"seen from above: {low:g} to {high:g} m above the floor, which is {_format_floor(floor)}")
         say("free is what was seen free in all of that; for a lower robot: --heights LO:HI")
+    elif flat:
+        say(f"no 2-D map in it: {NO_FLOOR}; {CURE}")
     if arguments.inflate is not None:
         result["inflated_m"] = arguments.inflate
         say(f"obstacles grown by {arguments.inflate:g} m and one cell")
@@ -71,6 +77,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
         beside = f" and {file.with_suffix('.pgm' if ending == '.yaml' else '.yaml')}"
     say(f"saved {file}{beside} ({size(result['bytes'])})")
     return result
+
+
+def _format_floor(floor: FloorHeights) -> str:
+    if not floor.height.size:
+        return f"stated to be at {floor.elsewhere:g} m"
+    seen = floor.height[floor.away == 0]
+    return f"found at each place, {seen.min():.2f} to {seen.max():.2f} m from the world's origin"
 
 
 def _export_floor(arguments: Namespace) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from stereovox.formats.octomap import read_octomap
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.maps.store import is_map
+from stereovox.products.floor_heights import FloorHeights
 from stereovox.trust.history import Imported
 
 CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".bin", ".stl", ".obj", ".off")
@@ -86,7 +87,7 @@ def export(
     path: str | Path,
     heights: tuple[float, float] | None = None,
     inflate: float | None = None,
-    floor: float | None = None,
+    floor: FloorHeights | float | None = None,
     start: ArrayLike | None = None,
 ) -> None:
     """Write a map in the format that the file name's ending selects; a failed export leaves an older file intact.
@@ -99,7 +100,8 @@ def export(
         heights: For 2-D maps and bags: lowest and highest metres above the floor that a robot occupies (see
             `projection.project`).
         inflate: For 2-D maps: robot radius in metres by which obstacles grow (see `projection.inflated_grid`).
-        floor: For 2-D maps and bags: height in metres of a level floor, from the world's origin; None: it is found.
+        floor: For 2-D maps and bags: the floor, or the height in metres of a level one in the world; None: it
+            is found. A bag of a map without a floor holds no 2-D map.
         start: For 2-D maps and bags: (3,) metres, near the floor that counts, of several.
 
     Raises:

@@ -16,6 +16,7 @@ from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_o
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.floor_axes import upright_axes
+from stereovox.products.floor_heights import FloorHeights, floor_of_map
 from stereovox.products.projection import Heights, project
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import Wire
@@ -40,14 +41,14 @@ def write_bag(
     voxel_map: VoxelMap,
     path: str | Path,
     heights: Heights | None = None,
-    floor: float | None = None,
+    floor: FloorHeights | float | None = None,
     start: ArrayLike | None = None,
 ) -> None:
     """Write the map into a bag of its own, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), all latched.
 
     `/octomap_full`: an Octomap of every known cell with its log-odds. `/occupied_cells`: a PointCloud2 of the centres
     of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights, floor and start: see
-    `projection.project`.
+    `projection.project`; left out if the map shows no floor.
     All are in frame `map`; where the map's `up` is not z, the first two are in `map_cells`, which `/tf_static` turns.
     Stamps are the last frame's, or zero. Raises MapFileError for what cannot be written, MissingExtra
     without rosbags.
@@ -57,7 +58,8 @@ def write_bag(
     stamp_ns = 0 if voxel_map.viewpoint is None else voxel_map.viewpoint.stamp_ns
     frame = CELLS_FRAME if turned else MAP_FRAME
     try:
-        grid, tree = project(voxel_map, heights, floor, start), full_tree(voxel_map).data
+        found, tree = floor_of_map(voxel_map, floor, start), full_tree(voxel_map).data
+        grid = project(voxel_map, heights, found) if found.known else None
         with BagWriter(path) as bag:
             if turned:
                 T_map_cells = np.eye(4)
@@ -65,7 +67,8 @@ def write_bag(
                 bag.fixed(MAP_FRAME, CELLS_FRAME, T_map_cells)
             bag.octomap(stamp_ns, tree, voxel_map.voxel_size, frame_id=frame)
             bag.cloud(stamp_ns, voxel_map.occupied(), frame_id=frame)
-            bag.occupancy(stamp_ns, grid, frame_id=MAP_FRAME)
+            if grid is not None:
+                bag.occupancy(stamp_ns, grid, frame_id=MAP_FRAME)
     except SourceError as error:
         raise MapFileError(str(error)) from None
     except ImportError:

@@ -17,6 +17,7 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
 from stereovox.products.floor_axes import Heights
+from stereovox.products.floor_heights import FloorHeights
 from stereovox.products.projection import inflated_grid, project
 from stereovox.safe_io import MAX_YAML, read_bounded, replacing, shown, yaml_value
 
@@ -107,7 +108,7 @@ def write_grid(
     path: str | Path,
     heights: Heights | None = None,
     inflate: float | None = None,
-    floor: float | None = None,
+    floor: FloorHeights | float | None = None,
     start: ArrayLike | None = None,
 ) -> None:
     """Write the map seen from above as map_server's two files, an image and its .yaml; `path` names either.

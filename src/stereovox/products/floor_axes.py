@@ -57,6 +57,14 @@ def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
 
 
 def checked_heights(heights: Heights) -> Heights:
+    """Validate two heights; raises StereovoxError if they do not ascend."""
+    low, high = heights
+    if not low < high:
+        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
+    return low, high
+
+
+def checked_band(heights: Heights) -> Heights:
     """Validate two heights above the floor; raises StereovoxError if they do not ascend from 0 or more."""
     low, high = heights
     if not (0 <= low < high < np.inf):

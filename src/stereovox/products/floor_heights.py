@@ -162,20 +162,32 @@ class FloorHeights:
         return self.height[inside].astype(float), self.away[inside] + outside
 
 
-def floor_of_map(voxel_map: VoxelMap, stated: float | None = None, start: ArrayLike | None = None) -> FloorHeights:
+def floor_of_map(
+    voxel_map: VoxelMap, stated: FloorHeights | float | None = None, start: ArrayLike | None = None
+) -> FloorHeights:
     """Return the floor of a map: the level one that is stated, or that `scan.floor` states, or else what is found.
 
     Args:
         voxel_map: The map.
-        stated: Metres along the map's `up` from the world's origin; None: `scan.floor`.
+        stated: Metres along the map's `up` from the world's origin, or a floor that was found before; None:
+            `scan.floor`.
         start: See `find_floor`; with it the floor is found.
 
     Raises:
-        StereovoxError: The floor is known nowhere, or as `find_floor`.
+        StereovoxError: As `find_floor`.
     """
+    if isinstance(stated, FloorHeights):
+        return stated
     config = voxel_map.config
     stated = config.scan.floor if stated is None and start is None else stated
-    floor = find_floor(voxel_map, start) if stated is None else FloorHeights.level(stated, config.up)
+    return find_floor(voxel_map, start) if stated is None else FloorHeights.level(stated, config.up)
+
+
+def known_floor(
+    voxel_map: VoxelMap, stated: FloorHeights | float | None = None, start: ArrayLike | None = None
+) -> FloorHeights:
+    """Return the floor as `floor_of_map`; raises StereovoxError, with the cure, if its height is known nowhere."""
+    floor = floor_of_map(voxel_map, stated, start)
     if not floor.known:
         raise StereovoxError(f"{NO_FLOOR}; {CURE}")
     return floor

@@ -160,5 +160,5 @@ class FloorSearch:
         for radius in RADII:
             window = 2 * max(1, round(radius / self._floor.resolution)) + 1
             lowest = minimum_filter(levels, window, mode="nearest")
-            leaks |= (levels - lowest - self._step - 1) * self._floor.side > STEEPEST * radius
+            leaks |= (levels - lowest - self._step) * self._floor.side > STEEPEST * radius
         return leaks

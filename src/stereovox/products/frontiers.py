@@ -17,8 +17,8 @@ from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.queries import points_of
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.floor_axes import Heights, checked_heights, heights_of
-from stereovox.products.floor_heights import floor_of_map
+from stereovox.products.floor_axes import Heights, checked_band, heights_of
+from stereovox.products.floor_heights import known_floor
 from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
 from stereovox.products.side_by_side import in_memory
 from stereovox.safe_io import replacing
@@ -90,9 +90,9 @@ def frontiers(
     free, at_unknown = _free_cells(voxel_map)
     cells = free[at_unknown]
     if heights is not None:
-        low, high = checked_heights(heights)
+        low, high = checked_band(heights)
         centres = voxel_map.centers(cells)
-        above = floor_of_map(voxel_map, floor).at(centres, reach=np.inf)
+        above = known_floor(voxel_map, floor).at(centres, reach=np.inf)
         height = heights_of(centres, voxel_map.config.up) - above
         cells = cells[(height > low) & (height <= high)]
     reached = KDTree(_reached(voxel_map, free, start, radius))

@@ -18,7 +18,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.storage import EVERYWHERE
-from stereovox.products.floor_axes import Heights, check_level, checked_heights, floor_axes
+from stereovox.products.floor_axes import Heights, check_level, checked_band, floor_axes
 from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, find_floor
 from stereovox.products.projection import patch_of, shown_percent
 
@@ -73,7 +73,7 @@ class LiveProjection:
         if config.cell[across] != config.cell[along]:
             raise StereovoxError(f"steps {list(config.cell)}: a grid of the floor needs cells as long as wide")
         floor = config.scan.floor if floor is None else floor
-        self._heights = checked_heights(heights or config.scan.heights)
+        self._heights = checked_band(heights or config.scan.heights)
         self._floor = FloorHeights.unknown(config.up) if floor is None else FloorHeights.level(floor, config.up)
         self._floor_s, self._notify, self._clock = floor_s, notify, clock
         self._due, self._tries, self._seek = -np.inf, 0, floor is None

@@ -21,8 +21,8 @@ from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.products import _projection
-from stereovox.products.floor_axes import MAX_CELLS, Heights, check_level, checked_heights, floor_axes
-from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, floor_of_map
+from stereovox.products.floor_axes import MAX_CELLS, Heights, check_level, checked_band, floor_axes
+from stereovox.products.floor_heights import FloorHeights, known_floor
 from stereovox.products.transform import transformed
 from stereovox.threads import one_state
 
@@ -69,12 +69,8 @@ def project(
             not level.
     """
     check_level(voxel_map.config)
-    heights = checked_heights(heights or voxel_map.config.scan.heights)
-    if not isinstance(floor, FloorHeights):
-        floor = floor_of_map(voxel_map, floor, start)
-    elif not floor.known:
-        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
-    grid = from_above(voxel_map, heights, floor)
+    heights = checked_band(heights or voxel_map.config.scan.heights)
+    grid = from_above(voxel_map, heights, known_floor(voxel_map, floor, start))
     if grid is None:
         band = f"{heights[0]:g} to {heights[1]:g} m above the floor"
         raise StereovoxError(f"{band} no place is known to be free or occupied; give other heights")

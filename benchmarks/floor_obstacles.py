@@ -1,26 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Obstacles that a 2-D grid of a 3-D map calls free, and how much of the free floor it calls free.
 
-    python benchmarks/floor_obstacles.py [SEEDS] [--kitchen FOLDER]
+    python benchmarks/floor_obstacles.py [--seeds N] [--first N] [--places N] [--kitchen FOLDER]
 
-Each scene is mapped in a world whose z = 0 is where the camera began. A column is an obstacle if a surface of the
-scene lies 0.1 to 1.8 m above the floor there, at any of 16 places of the column; the true floor is free elsewhere.
-Columns of which the map knows nothing in that band do not count. The truth comes from the planes of the scene's solids
-and shares no code with the products; that of a recording from the map's own occupied cells above a plane fitted to its
-floor.
+Each scene is mapped in a world whose z = 0 is where the camera began. A column is an obstacle if a surface of the scene
+lies 0.1 to 1.8 m above the floor there, at any of 16 places of the column; the true floor is free elsewhere. Columns of
+which the map knows nothing in that band do not count. "Missed" are obstacles of which the map itself has only free
+cells in the band: what the sensor lost, no projection can find. Free floor is what was seen as floor and has no
+obstacle. "before" is the earlier rule: the band from the world's origin, cleared by free cells at any height. The truth
+comes from the planes of the scene's solids and shares no code with the products; that of a recording from the map's own
+occupied cells above a plane fitted to its floor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import argparse
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 import stereovox as sv
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products.projection import project
 from stereovox.se3 import look_at
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.honest import honest_d435, honest_kinect
@@ -171,6 +177,7 @@ class Score:
 
     obstacles: int
     called_free: int
+    missed: int
     floor: int
     stays_free: int
 
@@ -180,18 +187,19 @@ class Score:
     def __str__(self) -> str:
         wrong, right = self.called_free / max(self.obstacles, 1), self.stays_free / max(self.floor, 1)
         return (
-            f"{self.called_free:6} of {self.obstacles:6} obstacles free ({wrong:6.2%}), "
+            f"{self.called_free:6} of {self.obstacles:6} obstacles free ({wrong:6.2%}; {self.missed} missed), "
             f"{self.stays_free:6} of {self.floor:6} of the floor ({right:5.1%})"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Middles (N, 2) of the columns in metres of the map, and which count as obstacles, and as free floor."""
+    """Middles (N, 2) of columns in metres of the map; which count as obstacles, as free floor, and which the map lost."""
 
     places: NDArray
     obstacles: NDArray
     floor: NDArray
+    lost: NDArray
 
 
 def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray) -> Truth:
@@ -211,19 +219,22 @@ def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray) -> Truth:
             inside[near] |= (solid.part == "floor") & (bottom < top)
     middle = (columns + 0.5) * side
     base = world.floor(middle[:, 0] + origin[0]) - origin[2]
-    known, seen_floor = np.zeros(len(columns), bool), np.zeros(len(columns), bool)
+    known, seen_floor, lost = np.zeros(len(columns), bool), np.zeros(len(columns), bool), np.ones(len(columns), bool)
     for above in np.arange(BAND[0] + side / 2, BAND[1], side):
-        known |= voxel_map.state(np.column_stack([middle, base + above])) != sv.State.UNKNOWN
+        state = voxel_map.state(np.column_stack([middle, base + above]))
+        known |= state != sv.State.UNKNOWN
+        lost &= state == sv.State.FREE
     for above in (-side, 0, side):
         seen_floor |= voxel_map.state(np.column_stack([middle, base + above])) == sv.State.OCCUPIED
-    return Truth(middle, obstacle & known & inside, ~obstacle & seen_floor & inside)
+    return Truth(middle, obstacle & known & inside, ~obstacle & seen_floor & inside, lost)
 
 
 def score(grid: OccupancyGrid, truth: Truth) -> Score:
     """Count what a grid calls free."""
     free = _state(grid, truth.places) == sv.State.FREE
+    wrong = truth.obstacles & free
     return Score(*(int(np.count_nonzero(which)) for which in
-                   (truth.obstacles, truth.obstacles & free, truth.floor, truth.floor & free)))  # fmt: skip
+                   (truth.obstacles, wrong, wrong & truth.lost, truth.floor, truth.floor & free)))  # fmt: skip
 
 
 def _through(solid: Solid, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
@@ -248,11 +259,94 @@ def _state(grid: OccupancyGrid, places: NDArray) -> NDArray:
     return states
 
 
-def worlds(seeds: int) -> Iterator[tuple[World, str, float, int]]:
+def before(voxel_map: sv.VoxelMap) -> OccupancyGrid:
+    """Return the grid by the earlier rule."""
+    cells, _ = voxel_map.cells()
+    state = voxel_map.state(voxel_map.centers(cells))
+    low = cells[:, :2].min(axis=0)
+    shape = tuple((cells[:, :2].max(axis=0) + 1 - low)[::-1])
+    grid, place = np.full(shape, -1, np.int8), tuple((cells[:, :2] - low)[:, ::-1].T)
+    height = (cells[:, 2] + 0.5) * voxel_map.voxel_size
+    within = (height > BAND[0]) & (height <= BAND[1])
+    steps = ((state == sv.State.FREE, 0), (within & (state == sv.State.TENTATIVE), 50), (within & (state == 3), 100))
+    for which, percent in steps:
+        grid[tuple(at[which] for at in place)] = percent
+    x, y = (low * voxel_map.voxel_size).tolist()
+    return OccupancyGrid(grid, voxel_map.voxel_size, (x, y, 0.0))
+
+
+def kitchen(folder: str) -> None:
+    """Judge grids of a recording that was levelled, and tracked: its own occupied columns above a plane are the truth."""
+    for name, settings in {"levelled": {"level": True}, "tracked": {"poses": "track"}}.items():
+        with TemporaryDirectory() as place:
+            found = sv.map_recording(folder, Path(place) / "map.svox", **settings).map
+            for heights in (BAND, (0.1, 1.2)):
+                truth = truth_of_plane(found, heights)
+                print(f"{Path(folder).name}, {name}, {heights[0]:g} to {heights[1]:g} m", flush=True)
+                print(
+                    f"  before: {score(before(found), truth)}\n  now:    {score(project(found, heights), truth)}",
+                    flush=True,
+                )
+
+
+def truth_of_plane(voxel_map: sv.VoxelMap, heights: tuple[float, float]) -> Truth:
+    """Return the columns with occupied cells between two heights above the plane of most of the lowest ones."""
+    occupied, random, side = voxel_map.occupied(), np.random.default_rng(0), voxel_map.voxel_size
+    low = occupied[occupied[:, 2] < np.percentile(occupied[:, 2], 20)]
+    best: tuple[int, NDArray] = (0, low[:0])
+    for _ in range(3000):
+        a, b, c = low[random.integers(len(low), size=3)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length > 1e-6 and abs(normal[2]) > 0.97 * length:
+            inliers = low[np.abs((low - a) @ (normal / length)) < 0.03]
+            best = max(best, (len(inliers), inliers), key=lambda pair: pair[0])
+    centre = best[1].mean(axis=0)
+    normal = np.linalg.svd(best[1] - centre)[2][2]
+    height = (occupied - centre) @ (normal * np.sign(normal[2]))
+    columns = np.floor(occupied[:, :2] / side).astype(int)
+    every, of_cell = np.unique(columns, axis=0, return_inverse=True)
+    obstacle, floor = np.zeros(len(every), bool), np.zeros(len(every), bool)
+    np.logical_or.at(obstacle, of_cell.ravel(), (height > heights[0]) & (height < heights[1]))
+    np.logical_or.at(floor, of_cell.ravel(), np.abs(height) < 0.06)
+    return Truth((every + 0.5) * side, obstacle, floor & ~obstacle, np.zeros(len(every), bool))
+
+
+def worlds(seeds: Sequence[int], places: int) -> Iterator[tuple[World, str, float, int]]:
     """All scenes with camera, cell side and seed."""
-    for seed in range(seeds):
-        camera, eye = ("simple", "d435", "kinect")[seed % 3], (1.3, 0.45, 0.8)[seed % 3]
-        yield furnished("level", flat, [], seed, eye, 120), camera, 0.05, seed
-        yield furnished("ramp of 10 degrees", ramp(0.176), [2.0, 8.0], seed, eye, 120), camera, 0.05, seed
-        yield furnished("step of 0.08 m", step(0.08), [4.0], seed, eye, 120), camera, 0.05, seed
-        yield furnished("step of 0.3 m", step(0.3), [4.0], seed, eye, 120), camera, 0.05, seed
+    for seed in seeds:
+        camera, eye = ("simple", "d435", "kinect")[seed % 3], (1.3, 0.45, 0.8)[seed // 3 % 3]
+        for name, floor, cuts in (
+            ("level", flat, []), ("ramp of 10 degrees", ramp(0.176), [2.0, 8.0]),
+            ("step of 0.08 m", step(0.08), [4.0]), ("step of 0.3 m", step(0.3), [4.0]),
+        ):  # fmt: skip
+            yield furnished(name, floor, cuts, seed, eye, 120), camera, 0.05, seed
+    for name in ("room?image_width=160", "apartment", "hall?plan=3", "hall?plan=5")[:places]:
+        yield built_in(name, 160), "simple", 0.05, 0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--places", type=int, default=4)
+    parser.add_argument("--kitchen")
+    options = parser.parse_args()
+    totals = {name: Score(0, 0, 0, 0, 0) for name in ("before", "now", "now, 0.1 to 1.2 m")}
+    for world, camera, side, seed in worlds(range(options.first, options.first + options.seeds), options.places):
+        voxel_map, origin = mapped(world, camera, side, seed)
+        truth = truth_of(voxel_map, world, origin)
+        grids = (before(voxel_map), project(voxel_map), project(voxel_map, (BAND[0], 1.2)))
+        print(f"{world.name}, {camera}, seed {seed}")
+        for name, grid in zip(totals, grids, strict=True):
+            found = score(grid, truth)
+            totals[name] += found
+            print(f"  {name:18} {found}", flush=True)
+    for name, total in totals.items():
+        print(f"all, {name:18} {total}")
+    if options.kitchen:
+        kitchen(options.kitchen)
+
+
+if __name__ == "__main__":
+    main()

@@ -21,6 +21,6 @@ print(mapper.occupancy().cells.shape, "cells of the corridor")
 space = sv.Mapper(voxel_size=0.1)
 for frame in sv.open_source("sim:room", frames=":4"):
     space.add(frame)
-grid = project(space.map, heights=(0.1, 1.8))  # what is 0.1 to 1.8 m high marks; what is free at any height clears
+grid = project(space.map, heights=(0.1, 1.8))  # what a robot of 1.8 m occupies above the floor, which is found
 write_map_server(grid, "room.yaml")
 print(grid.cells.shape, "cells of the room, states", sorted(set(grid.states.ravel().tolist())))

@@ -114,7 +114,8 @@ def test_a_little_tilt_and_a_sensor_upside_down_are_fine():
 def wall_frame(distance=2.0):
     camera = sv.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.075)
     pose = np.array([[0, 0, 1, 0.03], [-1, 0, 0, 0.02], [0, -1, 0, 0.3], [0, 0, 0, 1.0]])  # looks along world x
-    return sv.Frame(np.full((60, 80), distance, np.float32), camera, pose)
+    depth = np.minimum(distance, 0.3 / np.maximum((np.arange(60) - 29.5) / 60, 1e-3))  # its floor is at 0
+    return sv.Frame(np.repeat(depth[:, None], 80, axis=1).astype(np.float32), camera, pose)
 
 
 @pytest.mark.parametrize("method", ["rows", "cloud"])
@@ -126,6 +127,21 @@ def test_depth_images_are_mapped_too(method):
     bad = mapper.add(replace(wall_frame(), depth=np.zeros((3, 3), np.uint16)))
     assert bad.refused == "bad_shape"
     assert (mapper.map.frames, mapper.map.frames_refused) == (8, 1)
+
+
+@pytest.mark.parametrize(("height", "floor", "refused"), [
+    (1.2, None, None), (0.0, None, "below_floor"), (0.4, None, "below_floor"), (0.0, -1.2, None), (1.2, 1.2, "below_floor"),
+])  # fmt: skip
+def test_a_world_that_begins_at_the_camera_has_its_floor_elsewhere(height, floor, refused):
+    """The camera looks at a floor 1.2 m below it, a wall 4 m ahead."""
+    mapper = GridMapper(voxel_size=0.1, **{"scan.floor": floor})
+    camera = sv.PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5)
+    down = (np.arange(48) - 23.5) / 40
+    depth = np.minimum(4.0, 1.2 / np.maximum(down, 1e-3))[:, None] * np.ones(64)
+    T = np.array([[0, 0, 1.0, 0], [-1, 0, 0, 0], [0, -1, 0, height], [0, 0, 0, 1]])
+    report = mapper.add(sv.Frame(depth.astype(np.float32), camera, T))
+    assert report.refused == refused
+    assert refused is None or "scan.floor" in report.detail
 
 
 @pytest.mark.parametrize("as_picture", [True, False])

@@ -90,7 +90,6 @@ def test_paths_are_checked(saved, tmp_path, capsys):
         (["path", "MAP", "1,1", "2,2,2", "--radius", "0.3"], "'1,1' is not a point"),
         (["path", "MAP", "1,1,1", "2,2,2", "--radius", "-1"], "0 m or more"),
         (["path", "MAP", "1,1,1", "2,2,2"], "--radius"),
-        (["path", "MAP", "1,1,9", "2,2,9", "--radius", "0.1", "--picture", "p.png"], "own are 0.00 to 1.20 m\n"),
         (["path", "no.svox", "1,1,1", "2,2,2", "--radius", "1"], "no.svox"),
     ],
 )

@@ -11,6 +11,8 @@ from stereovox.errors import StereovoxError
 from stereovox.products.projection import project
 from stereovox.ros.mapping import Mapping
 
+STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}
+"""The walk's images show no floor: its world stands on it."""
 WINDOW = {"window.size": [2.4, 2.4, 2.4], "window.trigger": 0.3, "window.outside": "keep"}
 
 
@@ -22,7 +24,7 @@ def check_grid(mapping: Mapping) -> None:
 
 @pytest.mark.parametrize("settings", [{}, WINDOW, {"map.keep_times": True, "map.forget_s": 0.35}])
 def test_the_grid_is_that_of_the_map(tmp_path, settings):
-    mapping = Mapping(load_config(voxel_size=0.1, **settings))
+    mapping = Mapping(load_config(voxel_size=0.1, **STANDS, **settings))
     for k in range(5):
         assert mapping.add(depth_at(k)).refused is None
         check_grid(mapping)
@@ -43,7 +45,7 @@ def test_the_grid_is_that_of_the_map(tmp_path, settings):
 
 
 def test_what_cannot_be_saved_is_one_line(tmp_path):
-    mapping = Mapping(load_config(voxel_size=0.1))
+    mapping = Mapping(load_config(voxel_size=0.1, **STANDS))
     mapping.add(depth_at(0))
     (tmp_path / "file").touch()
     for name in ("/proc/no/map", str(tmp_path / "file/map"), str(tmp_path / ("x" * 300)), str(tmp_path / "a\0b")):

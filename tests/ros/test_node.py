@@ -38,6 +38,8 @@ from stereovox.simulate.simulation import Simulation  # noqa: E402
 TFMessage = tf_message()
 Octomap = optional_message("octomap_msgs", "Octomap")
 MOUNT = f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708"
+STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}
+"""The images of the walk show no floor: its world stands on it."""
 BY_TF = {"odometry": (), "fixed": ()} if TFMessage else {"odometry": ("/odom",), "fixed": (MOUNT,)}
 """tf2_msgs is not on PyPI: without it poses come by odometry."""
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -50,7 +52,7 @@ class Robot:
     def __init__(self, out: str):
         self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=60.0, out=out, **BY_TF)
         self.reports = []
-        self.mapping = Mapping(load_config(voxel_size=0.1))
+        self.mapping = Mapping(load_config(voxel_size=0.1, **STANDS))
         given = [rclpy.Parameter("voxel_size", value=0.1)]
         node = rclpy.create_node(
             "stereovox", parameter_overrides=given, automatically_declare_parameters_from_overrides=True
@@ -219,7 +221,7 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     monkeypatch.setattr("stereovox.ros.subscriptions.tf_message", lambda: None)
     other = rclpy.create_node("no_tf")
     options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(MOUNT,))
-    mapping, reports = Mapping(load_config(voxel_size=0.1)), []
+    mapping, reports = Mapping(load_config(voxel_size=0.1, **STANDS)), []
     maker = MapNode(other, mapping, options, str, reports.append)
     odometry = robot.send.get("/odom") or robot.other.create_publisher(Odometry, "/odom", 10)
     robot.maker = maker
@@ -240,7 +242,7 @@ def test_without_tf2_msgs_and_any_other_pose_the_node_says_so_at_once(robot, mon
     monkeypatch.setattr("stereovox.ros.subscriptions.tf_message", lambda: None)
     other = rclpy.create_node("no_poses")
     with pytest.raises(StereovoxError, match=r"^no poses: tf2_msgs is not installed.*--odometry") as error:
-        MapNode(other, Mapping(load_config(voxel_size=0.1)), Options(depth=(DEPTH,)), str)
+        MapNode(other, Mapping(load_config(voxel_size=0.1, **STANDS)), Options(depth=(DEPTH,)), str)
     assert len(str(error.value)) <= 300
     other.destroy_node()
 
@@ -256,7 +258,7 @@ def test_a_corrected_path_changes_what_is_published_and_no_frame_is_lost(robot):
     settings = {"voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1}
     other = rclpy.create_node("corrected")
     options = replace(robot.options, corrected_path="/path", path_frame="base_link", out="")
-    mapping = Mapping(load_config(**settings))
+    mapping = Mapping(load_config(**STANDS, **settings))
     robot.mapping.close()
     robot.maker = MapNode(other, mapping, options, str, robot.reports.append)
     robot.send["/path"] = robot.other.create_publisher(Path, "/path", 1)
@@ -271,7 +273,7 @@ def test_a_corrected_path_changes_what_is_published_and_no_frame_is_lost(robot):
     robot.correct(range(4), shift)  # when no image comes any longer
     robot.until(lambda: robot.maker.counts()["corrections"] == 2)
     assert robot.maker.counts()["frames_in_map"] == 7
-    new = Mapping(load_config(**settings))
+    new = Mapping(load_config(**STANDS, **settings))
     for k, kept in enumerate(mapping.mapper.map.kept_frames.frames):
         wanted = depth_at(k).T_world_sensor
         np.testing.assert_allclose(kept.T_world_sensor, shift @ wanted if k < 4 else wanted, atol=1e-5)
@@ -287,7 +289,7 @@ def test_a_jump_of_odometry_in_the_map_is_noticed_while_it_drives(robot):
     """Here the place of odom in the map comes as a pose; with tf2_msgs it may come by /tf as well."""
     other = rclpy.create_node("jumping")
     options = replace(robot.options, correct_jumps=True, world_frame="map", pose=("/slam=odom",), out="")
-    mapping = Mapping(load_config(voxel_size=0.1, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
+    mapping = Mapping(load_config(voxel_size=0.1, **STANDS, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
     robot.mapping.close()
     robot.maker = MapNode(other, mapping, options, str, robot.reports.append)
     robot.send["/slam"] = robot.other.create_publisher(PoseStamped, "/slam", 20)
@@ -339,7 +341,7 @@ def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
     frames = [source.frame(i) for i in range(0, 10, 2)]
     other = rclpy.create_node("tracked")
     options = Options(depth=(DEPTH,), fixed=(MOUNT,), poses="track", late_s=60.0)
-    mapping, reports = Mapping(load_config(voxel_size=0.1)), []
+    mapping, reports = Mapping(load_config(voxel_size=0.1, **STANDS)), []
     first, robot.maker = robot.maker, MapNode(other, mapping, options, str, reports.append)
     maker = robot.maker
     robot.listen(Odometry, "/tracked_odometry", 10)
@@ -383,7 +385,7 @@ def test_several_cameras_make_one_map(robot):
     mount = f"base_link {optical} -0.1 0 0.4 1.5707963 0 -1.5707963"
     options = replace(robot.options, depth=(DEPTH, back), fixed=(*robot.options.fixed, mount), out="")
     robot.mapping.close()
-    robot.mapping = Mapping(load_config(voxel_size=0.1))
+    robot.mapping = Mapping(load_config(voxel_size=0.1, **STANDS))
     robot.maker = MapNode(other, robot.mapping, options, str, robot.reports.append)
     robot.send |= {back: robot.other.create_publisher(Image, back, 20)}
     robot.send |= {info: robot.other.create_publisher(CameraInfo, info, 20)}
@@ -396,7 +398,7 @@ def test_several_cameras_make_one_map(robot):
     robot.drive(8)
     robot.until(lambda: len(robot.reports) == 16)
     assert [report.refused for report in robot.reports] == [None] * 16
-    new = Mapping(load_config(voxel_size=0.1))
+    new = Mapping(load_config(voxel_size=0.1, **STANDS))
     for k in range(8):
         ahead = depth_at(k)
         T = base_at(ahead.stamp_ns) @ turned @ T_BASE_CAMERA

@@ -49,9 +49,7 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
 
     Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
-    looks straight up or down, `heights_not_seen` where no ray meets the heights, `below_floor` where
-    the camera, or much of what it sees, lies below the floor, so that the floor is elsewhere; ConfigError where z is
-    not up.
+    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
     """
     if config.up.removeprefix("+") != "z":
         raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
@@ -61,7 +59,6 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
         rows = level_rows(image, rays, turn, config.scan.rows, config.scan.off_level_deg)
         rays, heights = rays.of_rows(rows), (-np.inf, np.inf)
     camera = float(image.T_world_sensor[2, 3]) - (config.scan.floor or 0.0)
-    check_floor(image, turn, camera)
     check_heights(image, rays, turn, heights, config.max_range, camera)
     step = config.scan.angle_step_deg
     where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
@@ -220,14 +217,17 @@ def check_heights(
         )
 
 
-def check_floor(image: DepthImage, turn: NDArray[np.float64], at: float) -> None:
-    """Raise FrameRefused `below_floor` where a camera `at` metres above the floor shows that the floor is elsewhere.
+def check_floor(image: DepthImage, config: Config) -> None:
+    """Raise FrameRefused `below_floor` if an image shows that the floor is not at `scan.floor`, or at 0.
 
-    It would be so in a world that begins at the camera: then all obstacles lie below the heights that count.
+    The camera, or much of what it sees, then lies deeper, as in a world that begins at the camera: obstacles would lie
+    below the heights that count, and their places would be free.
     """
+    at = float(image.T_world_sensor[2, 3]) - (config.scan.floor or 0.0)
     some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
     columns, rows = image.camera.rays()
-    rise = turn[2, 0] * columns[None, ::SPARSE] + (rows[::SPARSE] @ turn[2, 1:])[:, None]
+    upward = image.T_world_sensor[2, :3]
+    rise = upward[0] * columns[None, ::SPARSE] + (rows[::SPARSE] @ upward[1:])[:, None]
     deep = (at + image.depth_m[some] * rise)[image.reason[some] == Reason.VALID] < -DEEP
     share = float(deep.mean()) if deep.size else 0.0
     if at <= 0 or share > MOST_DEEP:

@@ -194,7 +194,7 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Middles (N, 2) of columns in metres of the map; which count as obstacles, as free floor, and which the map lost."""
+    """Middles (N, 2) of columns in metres of the map; which are obstacles, free floor, and lost by the map."""
 
     places: NDArray
     obstacles: NDArray
@@ -276,7 +276,7 @@ def before(voxel_map: sv.VoxelMap) -> OccupancyGrid:
 
 
 def kitchen(folder: str) -> None:
-    """Judge grids of a recording that was levelled, and tracked: its own occupied columns above a plane are the truth."""
+    """Judge grids of a recording that was levelled, and tracked, by its own occupied columns above a plane."""
     for name, settings in {"levelled": {"level": True}, "tracked": {"poses": "track"}}.items():
         with TemporaryDirectory() as place:
             found = sv.map_recording(folder, Path(place) / "map.svox", **settings).map

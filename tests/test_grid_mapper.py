@@ -130,7 +130,8 @@ def test_depth_images_are_mapped_too(method):
 
 
 @pytest.mark.parametrize(("height", "floor", "refused"), [
-    (1.2, None, None), (0.0, None, "below_floor"), (0.4, None, "below_floor"), (0.0, -1.2, None), (1.2, 1.2, "below_floor"),
+    (1.2, None, None), (0.0, None, "below_floor"), (0.4, None, "below_floor"), (0.0, -1.2, None),
+    (1.2, 1.2, "below_floor"),
 ])  # fmt: skip
 def test_a_world_that_begins_at_the_camera_has_its_floor_elsewhere(height, floor, refused):
     """The camera looks at a floor 1.2 m below it, a wall 4 m ahead."""

@@ -346,6 +346,7 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("tilted", 0): _posed(lambda T: _turned(T, 20, 0)),
     ("camera_tilted", 0): _posed(lambda T: _turned(T, 20, 2), **{"scan.method": "rows"}),
     ("camera_vertical", 0): _down,
+    ("below_floor", 0): _posed(lambda T: T, **{"scan.floor": 50.0}),
     ("heights_not_seen", 0): _posed(lambda T: _at(T, 2, 3, 100)),
     ("disagrees_with_map", 0): _contradicting,
     ("contradicts_map", 0): _doubted(0),

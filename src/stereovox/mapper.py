@@ -356,13 +356,9 @@ class GridMapper(Aged):
     def _to_scan(self, frame: AnyFrame) -> Scan:
         from stereovox.depth.scan import check_floor, scan_of
 
-<<<<<<< HEAD
-        return validate_upright_scan(scan_of(self._depth.image(self._depth.matched(frame)), self.config), self.config)
-=======
         image = self._depth.image(self._depth.matched(frame))
         check_floor(image, self.config)
-        return scan_of(image, self.config)
->>>>>>> d6ccae10 (Heights above the floor at every exit; scan.floor; depth images below the floor are refused; docs)
+        return validate_upright_scan(scan_of(image, self.config), self.config)
 
 
 def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap:

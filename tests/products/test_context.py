@@ -42,6 +42,7 @@ class World:
     def __init__(self, late_s=0.0, tilt=0.0, frames=8):
         self.ns = 10**15
         more = {"up_direction": (sin(tilt), 0.0, cos(tilt))} if tilt else {}
+        more["scan.floor"] = 0.0  # the wall's images show no floor
         self.mapper = sv.Mapper(
             voxel_size=0.2, max_range=4.0, clock=lambda: self.ns, stamp_clock=lambda: self.ns, **more
         )

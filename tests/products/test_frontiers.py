@@ -156,4 +156,4 @@ def test_heights_are_measured_above_the_floor_at_each_place():
     above = found[:, 2] - (found[:, 0] // 3 - 25)
     assert set(above.tolist()) == {5, 6, 7, 8}
     with pytest.raises(StereovoxError, match="shows no floor"):
-        frontiers(random_map(6), 1, heights=(0.2, 0.6))
+        frontiers(VoxelMap.from_cells(load_config(voxel_size=0.1), [[0, 0, 0]], [FREE]), 1, heights=(0.2, 0.6))

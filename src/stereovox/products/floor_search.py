@@ -26,6 +26,8 @@ GROWTH = 0.05
 """Metres by which neighbouring cells of one surface may differ; at least one cell."""
 AREA = 1.0
 """Square metres from which a surface is large, whatever others there are; only large ones may be a step apart."""
+LEAST = 0.25
+"""Square metres that a floor has at least."""
 STEEPEST = 0.4
 """Steepest floor, rise over run: 22 degrees."""
 RADII = (0.15, 0.25, 0.5, 1.0, 2.0)
@@ -86,7 +88,7 @@ class FloorSearch:
         if self._start is not None:
             return int(group[nearest_surface(self._floor, surfaces, self._start)])
         size = np.bincount(group)
-        large = self._large(group, min(AREA, LARGE * size.max() * self._floor.resolution**2))
+        large = self._large(group, max(LEAST, min(AREA, LARGE * size.max() * self._floor.resolution**2)))
         near = self._near(surfaces) & large[group]
         candidates = near if near.any() else large[group]
         mean = np.bincount(group, surfaces[:, 2]) / size

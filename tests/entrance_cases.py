@@ -155,7 +155,8 @@ def _not_frames(kind: str) -> list[Case]:
 
 
 def _wrong_mapper(kind: str) -> list[Case]:
-    return [Case(good(kind), mapper=GridMapper if kind == CLOUD else sv.Mapper)]
+    mapper = GridMapper if kind == CLOUD else sv.Mapper
+    return [Case(made, mapper=mapper) for made in (good(kind), good(kind, name=np.zeros(0)))]
 
 
 def _one_sensor_more(kind: str) -> list[Case]:

@@ -29,6 +29,7 @@ class DepthPipeline:
         if isinstance(frame, Frame):
             return frame  # `prepare` validates its fields
         if isinstance(frame, Cloud):
+            validate_fields(frame, Cloud)
             detail = "is a cloud, no image: it can be mapped with given poses, not tracked"
             raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
         validate_fields(frame, StereoFrame, Frame)

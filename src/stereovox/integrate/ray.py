@@ -109,7 +109,7 @@ class Ray:
 
     def _steps(self, image: DepthImage) -> float:
         """Return about how many cells the rays of an image cross."""
-        ends = image.depth_m.clip(0, np.float32(self._config.max_range))  # -inf has no ray; NaN has none and is left out
+        ends = image.depth_m.clip(0, np.float32(self._config.max_range))  # -inf and NaN have no ray
         metres = float(np.nansum(ends, dtype=np.float64))
         return OBLIQUE * metres / self._config.voxel_size
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write pages of docs/reference from argparse, the settings and the table of checks: python docs/make_reference.py.
+"""Write pages of docs/reference from argparse, the settings and the tables of checks and outputs.
+
+    python docs/make_reference.py
 
 A test compares the files with what is written here.
 """
@@ -18,6 +20,7 @@ from pydantic.fields import FieldInfo
 
 from stereovox import Config, cli, entrance, load_config, registry
 from stereovox.config import profile_names
+from stereovox.products import context
 from stereovox.sensors import SENSORS
 
 FOLDER = Path(__file__).resolve().parent / "reference"
@@ -31,8 +34,8 @@ COMMANDS = """# Commands
 - Options come after the command, and are written in full. A value that begins with a minus needs `=`: `--up=-y`.
 - Text and progress go to stderr. With `--json`, which every command has, the last line of stdout is one JSON object.
 - Exit status: 0 for success; 2 for bad usage or bad input, with one line that names the file or value and the remedy;
-  3 for a map that was written but may be wrong ([self-check](../robots.md#self-check)), and for a trajectory
-  with gaps ([tracking](../tracking.md)); 130 after Ctrl-C and 143 after
+  3 for a map that was written but may be wrong ([self-check](../robots.md#self-check)) or holds less than half of what
+  came, and for a trajectory with gaps ([tracking](../tracking.md)); 130 after Ctrl-C and 143 after
   SIGTERM. `map` and `grid` then save the map as far as it got.
 - Recordings are recognised by their contents, wherever they lie: [Recordings](../recordings.md).
 
@@ -83,6 +86,18 @@ Reasons that sources, trackers and localisation give:
 {others}
 """
 
+OUTPUTS = """# Outputs
+
+{source}
+
+What leaves a map: functions and classes of `stereovox` (`sv`), outputs of `stereovox live`, files by their ending, and
+ROS topics. For each property of the map, a cell says what the output does with it: it *uses* it, *refuses* if it is
+bad, *carries* it *along*, or the number of the note that says why it has no meaning there. [What a map promises](../safety.md) explains ages, health and what
+unknown means. In Python: `stereovox.products.context.OUTPUTS`.
+
+{table}
+"""
+
 
 def main() -> None:
     """Write the pages."""
@@ -93,13 +108,22 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """Return the text of each page by its file's name."""
-    return {"commands.md": _commands(), "settings.md": _settings(), "refusals.md": _refusals()}
+    return {
+        "commands.md": _commands(),
+        "settings.md": _settings(),
+        "refusals.md": _refusals(),
+        "outputs.md": _outputs(),
+    }
 
 
 def _refusals() -> str:
     others = [f"| `{reason}` | {when} |" for reason, when in entrance.ELSEWHERE.items()]
     source = SOURCE.format("stereovox.entrance")
     return REFUSALS.format(source=source, table="\n".join(entrance.table()), others="\n".join(others))
+
+
+def _outputs() -> str:
+    return OUTPUTS.format(source=SOURCE.format("stereovox.products.context"), table="\n".join(context.table()))
 
 
 def _commands() -> str:

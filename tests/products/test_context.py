@@ -2,6 +2,7 @@
 """The table of outputs: no output is missing, and each cell that claims something is true of the real output."""
 
 import ast
+import re
 from importlib import import_module
 from math import cos, sin
 from pathlib import Path
@@ -368,3 +369,25 @@ def test_a_context_says_what_the_mapper_knows():
 def test_directions_end_at_the_unknown():
     world = World(frames=1)
     assert len(directions.nearest_places(world.mapper.map, moved(world, 0.0))) == 40
+
+
+WORDS = {
+    "frame": "frame|world|body|pose",
+    "up": "level|tilt|upright",
+    "floor": "floor|ground",
+    "age": "old|age|stamp",
+    "health": "stale|health|lost",
+    "unknown": "unknown|known to be free",
+}
+"""What a docstring that speaks of a property says, one of these words at least."""
+
+
+@pytest.mark.parametrize("name", [name for name in OUTPUTS if name.startswith(("sv.", "live."))])
+def test_docstrings_state_what_is_used_or_refused(name):
+    home, _, called = name.partition(".")
+    output = getattr(sv if home == "sv" else live_outputs, called)
+    parts = [output, *(vars(output).values() if isinstance(output, type) else ())]
+    said = " ".join(part.__doc__ or "" for part in parts if hasattr(part, "__doc__")).lower()
+    for which, cell in OUTPUTS[name]._asdict().items():
+        if cell.startswith(("uses", "refuses")):
+            assert re.search(WORDS[which], said), f"{name} says nothing of {which}: {cell}"

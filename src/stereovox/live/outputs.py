@@ -55,7 +55,8 @@ class Output(Protocol):
 class GridFile:
     """Keeps the 2-D map of a growing map in map_server files, written anew in a thread of its own.
 
-    While the map is stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete.
+    While the map is stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete. Unknown
+    cells are never free.
 
     Args:
         mapper: The mapper whose map is projected.

@@ -36,7 +36,7 @@ class ObstacleSender:
     It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own
     reads the map; each message is for where the body is by its newest pose, of a frame that the map took in (`after`,
     `at`) or without one (`pose`), carried on to the present by the motion between the last two. It waits up to half a
-    period for the next frame.
+    period for the next frame. Unknown space ends what is free, as `SectorRules.unknown` says.
 
     Nothing is sent before the first frame, nor once any camera's newest frame shows what was more than `max_age_s` ago
     or the newest pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot reports its
@@ -45,7 +45,7 @@ class ObstacleSender:
     frame from there.
 
     `time_usec` and `time_boot_ms` are when the oldest of the cameras' newest frames was taken, by this machine's clock,
-    which the autopilot may ask for (TIMESYNC).
+    which the autopilot may ask for (TIMESYNC). A map whose layers are not level is refused: nothing is sent.
 
     Args:
         mapper: The mapper whose map is sent.

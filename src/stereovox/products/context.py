@@ -73,6 +73,9 @@ def context_of(mapper: HasMap, world: str = "map") -> MapContext:
     )
 
 
+NO_MEANING = "not meaningful, because "
+
+
 class Leaves(NamedTuple):
     """What an output does with each property of a map."""
 
@@ -86,7 +89,7 @@ class Leaves(NamedTuple):
 
 def nothing(why: str, age: str = "", health: str = "") -> Leaves:
     """Return that no property has a meaning, but for age and health where they are given."""
-    none = f"not meaningful, because {why}"
+    none = f"{NO_MEANING}{why}"
     return Leaves(none, none, none, age or none, health or none, none)
 
 
@@ -164,3 +167,25 @@ OUTPUTS: dict[str, Leaves] = {
     "topic map": nothing("it is the map that was given, or SLAM's own"),
 }
 """What each output does with each property: names of `stereovox` (`sv.`), outputs of live runs, formats, ROS topics."""
+
+
+def table() -> list[str]:
+    """Return `OUTPUTS` as lines of Markdown; outputs that do the same share a line, and reasons are notes below."""
+    alike: dict[Leaves, list[str]] = {}
+    notes: list[str] = []
+    for name, leaves in OUTPUTS.items():
+        alike.setdefault(leaves, []).append(f"`{name}`")
+    lines = [f"| output | {' | '.join(Leaves._fields)} |", "|" + "---|" * (len(Leaves._fields) + 1)]
+    for leaves, names in alike.items():
+        lines.append(f"| {', '.join(names)} | {' | '.join(_shown(cell, notes) for cell in leaves)} |")
+    return [*lines, "", *(f"{number}. {note}" for number, note in enumerate(notes, 1))]
+
+
+def _shown(cell: str, notes: list[str]) -> str:
+    """Return a cell, or the number of its note."""
+    _, because, why = cell.partition(NO_MEANING)
+    if not because:
+        return cell
+    if why not in notes:
+        notes.append(why)
+    return f"- ({notes.index(why) + 1})"

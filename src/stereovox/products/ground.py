@@ -49,7 +49,7 @@ def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | N
         Height and footing of each cell of the floor.
 
     Raises:
-        StereovoxError: The map has no ground or is too large.
+        StereovoxError: The map has no ground, is not level, or is too large.
     """
     robot = robot or Robot()
     floor = floor_of(voxel_map)

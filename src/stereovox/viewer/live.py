@@ -33,7 +33,8 @@ class LiveView:
     """Page that shows the map of a `Mapper` while it grows. Pass each frame to `add` instead of the mapper's.
 
     It is also an `Observer` for `map_recording`. Between two frames the map is copied, and the page is drawn from the
-    copy in a thread of its own: nothing reads the map while a kernel writes it.
+    copy in a thread of its own: nothing reads the map while a kernel writes it. The page shows the health of the map,
+    also while no frame comes.
 
     Args:
         mapper: The mapper whose map is shown.

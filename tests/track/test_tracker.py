@@ -343,11 +343,17 @@ class Stub:
     def seek(self, seen, last):
         return [self.fit(seen, last, np.eye(6))]
 
+    def doubted(self, seen, fit):
+        return ""
+
+    def ambiguous(self, seen, T, known):
+        return ""
+
     def contradicted(self, seen, T):
         return ""
 
 
-@pytest.mark.parametrize(("away", "found"), [(5, True), (40, False)])
+@pytest.mark.parametrize(("away", "found"), [(5, True), (40, True), (120, False)])
 def test_long_after_a_loss_two_thirds_of_an_image_are_too_little_to_be_found_again(monkeypatch, away, found):
     """Of two stretches of an aisle that are alike, walls and floor are the same."""
     evidence = Stub()
@@ -363,3 +369,27 @@ def test_long_after_a_loss_two_thirds_of_an_image_are_too_little_to_be_found_aga
     assert ("" in said) == found
     evidence.known = 0.8
     assert "" in [by.add(replace(frame, stamp_ns=(18 + away + i) * STEP_NS)).lost for i in range(8)]
+
+
+FAULTS = {
+    "mirrored": lambda depth: depth[:, ::-1],
+    "upside down": lambda depth: depth[::-1],
+    "too far": lambda depth: (depth * 1.12).astype(depth.dtype),
+    "too near": lambda depth: (depth * 0.88).astype(depth.dtype),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_images_that_are_wrong_in_the_same_way_from_now_on_are_lost(fault):
+    taken = seen(BAYS, aside(26, (0, 0.03, 0)))
+    wrong = [replace(frame, depth=np.ascontiguousarray(FAULTS[fault](frame.depth)), reason=None) for frame in taken]
+    found = track([*taken[:16], *wrong[16:]])
+    assert found.tracked[:15] == list(range(1, 16))
+    assert not found.tracked[15:] or np.all(found.errors()[15:, 0] < 0.15)
+
+
+def test_after_a_second_of_darkness_it_is_found_where_it_went_meanwhile():
+    taken = seen(BAYS, aside(60, (0, 0.02, 0)))
+    found = track([*taken[:12], *map(covered, taken[12:42]), *taken[42:]])
+    assert found.lost[-1] <= 50
+    assert np.all(found.errors() < (0.05, 1))

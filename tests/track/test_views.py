@@ -10,7 +10,7 @@ from stereovox.se3 import look_at, rotation_matrix
 from stereovox.simulate.scene import Scene, box
 from stereovox.track.surfaces import LOOKED_THROUGH, MIN_PATCHES
 from stereovox.track.surfels import patches_of
-from stereovox.track.views import GRID, contradiction, far_apart, stood_free, unlike, view_of
+from stereovox.track.views import GRID, _seen_through, contradiction, far_apart, stood_free, unlike, view_of, with_edges
 
 
 def view(frame, T=None):
@@ -122,3 +122,35 @@ def test_a_camera_that_sees_all_round_has_a_view_of_what_is_ahead():
     assert found.slope.max() < 5
     behind = view_of(-np.abs(points), np.full(2000, 0.01, np.float32), np.eye(4))
     assert not np.isfinite(behind.depth).any()
+
+
+@pytest.mark.parametrize("step", [1, 3])
+def test_what_is_seen_through_is_counted_as_by_a_plain_loop(step):
+    one, other = VIEWS[1], VIEWS[3]
+    T, counts = np.linalg.inv(other.T) @ one.T, [0, 0]
+    for point, sigma in zip(one.points[::step].astype(float), one.sigma[::step], strict=True):
+        x, y, z = T[:3, :3] @ point + T[:3, 3]
+        if z <= 0.05:
+            continue
+        column = int(np.floor((x / z / other.slope[0] + 1) / 2 * GRID[1]))
+        row = int(np.floor((y / z / other.slope[1] + 1) / 2 * GRID[0]))
+        if 0 <= row < GRID[0] and 0 <= column < GRID[1] and np.isfinite(other.depth[row, column]):
+            away = other.depth[row, column] - z
+            slack = 4 * sigma + 0.04 * other.depth[row, column]
+            counts[0] += away > slack
+            counts[1] += abs(away) <= slack
+    assert counts[1] > 100
+    assert _seen_through(one, other, 4.0, step) == pytest.approx(counts, abs=1)
+
+
+def test_what_is_next_to_something_that_moves_moves_too_and_the_wall_behind_it_does_not():
+    """A board of which one half stands where nobody had looked."""
+    across, down = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.7, 0.7, 56))
+    board = (np.abs(across) < 0.2) & (np.abs(down) < 0.3)
+    depth = np.where(board, 1.0, 2.0)
+    points = np.stack([across * depth, down * depth, depth], -1).reshape(-1, 3).astype(np.float32)
+    free = (board & (across > -0.1)).ravel()
+    grown = with_edges(free, points, np.eye(4))
+    assert grown[free].all()
+    assert grown[board.ravel()].mean() > 0.95 > free[board.ravel()].mean()
+    assert not grown[~board.ravel()].any()

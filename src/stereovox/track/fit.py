@@ -39,13 +39,15 @@ class Fit(NamedTuple):
     """How an image fits what was seen before.
 
     T_map_camera: the pose (4, 4). covariance: (6, 6), rotation about the camera (radians), then shift (metres), along
-    the map's axes. known: share of the image's parts that were seen before. usual: share of those that fit.
+    the map's axes. known: share of the image's parts that were seen before. usual: share of those that fit. fine: share
+    of what is known roughly that is known closely too; a warped image fits in the large and not in the small.
     """
 
     T_map_camera: Transform
     covariance: NDArray[np.float64]
     known: float
     usual: float
+    fine: float = 1.0
 
 
 class Limits(NamedTuple):

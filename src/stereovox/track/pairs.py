@@ -104,6 +104,14 @@ class Pairs:
         self._followed = Sightings(self._camera)
         return [_fit(found, T, np.diag(SEARCH**2)) for T, found in self._landmarks.seek(seen)]
 
+    def doubted(self, seen: Sight, fit: Fit) -> str:
+        """Return what speaks against the pose of an image that follows: landmarks that agree on another one."""
+        return ""
+
+    def ambiguous(self, seen: Sight, T: Transform, known: float) -> str:
+        """Return "", as `contradicted`."""
+        return ""
+
     def contradicted(self, seen: Sight, T: Transform) -> str:
         """Return "": corners that fit by their looks are seldom anywhere else."""
         return ""

@@ -17,10 +17,21 @@ from stereovox.frame import AnyFrame, Frame
 from stereovox.integrate.views import PerCamera
 from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
-from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, settled
+from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, motion_between, settled
 from stereovox.track.photos import Beside, Photos, Sighted, sighted_or_why
-from stereovox.track.surfels import CONVERGED, Patches, SurfelMap, patches_of
-from stereovox.track.views import View, contradiction, is_new, stood_free, unlike, view_of
+from stereovox.track.surfels import CONVERGED, Elders, Patches, SurfelMap, beside_planes, patches_of
+from stereovox.track.views import (
+    View,
+    contradiction,
+    far_apart,
+    is_new,
+    passed_through,
+    stood_free,
+    turned,
+    unlike,
+    view_of,
+    with_edges,
+)
 
 BIAS = 3.0
 """Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
@@ -33,10 +44,30 @@ VIEW_M, VIEW_RAD, VIEWS = 0.3, np.radians(15), 1000
 """Views this far apart are kept, to find the way back from; so many, the latest."""
 TRIED = 6
 """Kept views that are tried when lost: those that look most like the image."""
+DETAILS = 2
+"""Which of the sizes says whether what tells places apart is known."""
+ASIDE = np.radians([0, -25, 25, -50, 50])
+"""By how much the last pose is turned aside where the way back is sought; the first two, the views most alike too."""
+ROUGHLY, ROUGH, CLOSELY, THROUGH = 2, 0.05, 4, 4.0
+"""Of so many patches one is laid roughly, until a step is below this share of a cell; so many poses are then laid
+closely, if they are not the same; what they look through
+counts so many times against them."""
+SAME_M, SAME_RAD = 0.1, np.radians(5)
 SEARCH = np.full(6, 0.4)
 """Radians and metres around them in which the pose is sought."""
-LOOKED_THROUGH = 0.05
+LOOKED_THROUGH = 0.03
 """Share of what is seen again that may lie where other views looked through: something that moved, not a wall."""
+STIR = 0.01
+"""Share of an image that stands where views looked through, from which on what is next to it moves too."""
+DISTURBED, CHECKED_BY, EVERY = 0.03, 3, 4
+"""Share of a view, looked through or standing where others looked, by which something moves or the pose is wrong; in
+so many of the nearest views, by one of so many of their points."""
+ELDERS_RAD, ELDERS_M = np.radians(1.5), 0.03
+"""Standard deviations up to which older surfels hold a pose by themselves."""
+ELDERS_OFF = np.diag(np.repeat([np.radians(0.3), 0.01], 3) ** 2)
+"""Covariance of a pose by older surfels besides its own."""
+AGREE, APART = 16.0, 100.0
+"""Squared deviations, of six, up to which they must agree while much moves, and while little does."""
 CLOSE, QUIETEST = 2.0, 0.01
 """Where a pose is expected with less than so many times the usual variance, most of an image lies where it should; what
 is far beyond the residuals of that moves, down to this variance of theirs, by what is expected of the camera."""
@@ -76,8 +107,8 @@ class Surfaces:
     def __init__(self, config: Config):
         self._config, self._depth = config, DepthPipeline(config)
         self._sigma: PerCamera[VirtualCamera, NDArray[np.float64]] = PerCamera(self._sigma_of)
-        self._map, self._views, self._learned = SurfelMap(), list[View](), 0
-        self._photos = Photos()
+        self._map, self._elders, self._views, self._learned = SurfelMap(), Elders(), list[View](), 0
+        self._photos, self._free = Photos(), 0.0
 
     def see(self, frame: AnyFrame) -> Seen:
         """Return what of a frame is used; raises FrameRefused, also where too few patches lie on surfaces."""
@@ -104,7 +135,7 @@ class Surfaces:
 
     def forget(self) -> None:
         """Forget all that was learned."""
-        self._map, self._views, self._learned = SurfelMap(), [], 0
+        self._map, self._elders, self._views, self._learned = SurfelMap(), Elders(), [], 0
         self._photos.forget()
 
     def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
@@ -124,7 +155,8 @@ class Surfaces:
         levels = self._map.levels(patches, quietest)
         stages = [Stage(level, CONVERGED * level.size) for level in levels]
         T, covariance = settled(stages, expected, doubt)
-        alone = Fit(T, covariance, levels[-1].known, levels[-1].usual)
+        rough, fine = levels[1].known, levels[2].known
+        alone = Fit(T, covariance, levels[-1].known, levels[-1].usual, min(fine / max(rough, 1e-6), 1.0))
         seen = None if beside is None else beside.fit(expected, doubt)
         if beside is None or seen is None:
             return alone
@@ -142,11 +174,16 @@ class Surfaces:
             T, covariance = settled(together[-1:], expected, doubt, T)
         else:  # the landmarks are right to a part of the finest surfels; coarse ones could only contradict them
             T, covariance = settled(together[-1:], expected, doubt, seen.T_map_camera)
-        return Fit(T, covariance, levels[-1].known, min(levels[-1].usual, LENIENT * beside.usual(T)))
+        return alone._replace(
+            T_map_camera=T, covariance=covariance, usual=min(levels[-1].usual, LENIENT * beside.usual(T))
+        )
 
     def _lasting(self, patches: Patches, T: Transform) -> Patches:
         """Return the patches of an image at T_map_camera that do not stand where views saw free space: people walk."""
-        there = ~stood_free(patches.points, patches.sigma, T, self._views)
+        free = stood_free(patches.points, patches.sigma, T, self._views)
+        if np.mean(free) > STIR:
+            free = with_edges(free, patches.points, T)
+        self._free, there = float(np.mean(free)), ~free
         return Patches(*(np.ascontiguousarray(part[there]) for part in patches))
 
     def advance(self, seen: Seen, T: Transform) -> None:
@@ -156,27 +193,85 @@ class Surfaces:
     def learn(self, seen: Seen, T: Transform) -> None:
         """Add an image that is believed to be at T_map_camera."""
         self._photos.learn(seen.sighted, T)
-        patches = seen.patches
-        self._map.add(self._lasting(patches, T), T)
+        lasting = self._lasting(seen.patches, T)
+        self._map.add(lasting, T)
+        self._elders.add(lasting, T)
         if is_new([view.T for view in self._views], T, VIEW_M, VIEW_RAD):
-            self._views = [*self._views[1 - VIEWS :], view_of(patches.points, patches.sigma, T)]
+            self._views = [*self._views[1 - VIEWS :], view_of(lasting.points, lasting.sigma, T)]
         self._learned += 1
         if self._learned % CHECKED == 0:
             self._map.forget(T[:3, 3], KEPT_M)
+            self._elders.forget(T[:3, 3], KEPT_M)
             self._views = [view for view in self._views if np.abs(view.T[:3, 3] - T[:3, 3]).max() < KEPT_M]
 
     def seek(self, seen: Seen, last: Transform) -> list[Fit]:
-        """Return how an image fits at the last pose and near the kept views that look most like it."""
+        """Return how an image fits at the last pose, turned from it, and near the kept views that look most like it.
+
+        It is laid roughly onto the surfels from each, and closely from those where that fits best.
+        """
         here = view_of(seen.patches.points, seen.patches.sigma, last)
-        alike = sorted(self._views, key=lambda view: unlike(view, here))
+        alike = [view.T for view in sorted(self._views, key=lambda view: unlike(view, here))[:TRIED]]
         common = self._photos.seek(seen.sighted)
-        starts = [(last, None), *((view.T, None) for view in alike[:TRIED]), *common]
+        places = [*turned(last, ASIDE), *alike, *(T for one in alike[:2] for T in turned(one, ASIDE[1:3]))]
         doubt = np.diag(SEARCH**2)
-        fits = [self._fit(seen.patches, beside, T, doubt, 1.0) for T, beside in starts]
+        starts = [(T, None) for T in self._roughly(seen.patches, here, places, doubt)]
+        fits = [self._fit(seen.patches, beside, T, doubt, 1.0) for T, beside in (*starts, *common)]
         agreed = next((beside for T, beside in common if beside.fit(T, doubt)), None)
         if agreed is None:
             return fits
         return [fit._replace(usual=min(fit.usual, LENIENT * agreed.usual(fit.T_map_camera))) for fit in fits]
+
+    def _roughly(
+        self, patches: Patches, here: View, places: list[Transform], doubt: NDArray[np.float64]
+    ) -> list[Transform]:
+        """Return the poses, apart from each other, near these places at which an image fits best in large cells, and
+        looks through little that was seen.
+        """
+        found, kept = list[tuple[float, Transform]](), list[Transform]()
+        few = patches.thinned(ROUGHLY)
+        for place in places:
+            levels = self._map.levels(few)[:2]
+            T, _ = settled([Stage(level, ROUGH * level.size) for level in levels], place, doubt)
+            through = passed_through(here._replace(T=T), self._views, CHECKED_BY, EVERY)
+            found.append((levels[1].known * levels[1].usual * max(1 - THROUGH * through, 0.0), T))
+        for _, T in sorted(found, key=lambda one: -one[0]):
+            if len(kept) < CLOSELY and all(far_apart(T, other, SAME_M, SAME_RAD) for other in kept):
+                kept.append(T)
+        return kept
+
+    def doubted(self, seen: Seen, fit: Fit) -> str:
+        """Return what speaks against the pose of an image that follows, "" where nothing does.
+
+        Where much of the view is elsewhere than it was, something moves, or the pose is wrong: then older surfels must
+        hold the same pose.
+        """
+        patches, T = self._lasting(seen.patches, fit.T_map_camera), fit.T_map_camera
+        here = view_of(seen.patches.points, seen.patches.sigma, T)
+        stir = max(self._free, passed_through(here, self._views, CHECKED_BY, EVERY))
+        if stir <= STIR:
+            return ""
+        elder = self._elders.fit(patches, T)
+        turn, shift = deviations(elder.covariance)
+        off = motion_between(T, elder.T_map_camera)
+        squares = float(off @ np.linalg.solve(elder.covariance + ELDERS_OFF, off))
+        held = turn < ELDERS_RAD and shift < ELDERS_M
+        if held and squares > (AGREE if stir > DISTURBED else APART):
+            words = f"{np.linalg.norm(off[3:]):.2f} m and {np.degrees(np.linalg.norm(off[:3])):.1f} degrees"
+            return f"what was seen longer ago lies {words} elsewhere"
+        return "" if held or stir <= DISTURBED else f"{stir:.0%} of the view moves, and the rest does not hold the pose"
+
+    def ambiguous(self, seen: Seen, T: Transform, known: float) -> str:
+        """Return why an image may be from another place that is like that at T_map_camera, "" where it is not.
+
+        Any corner of a room lies on any other: so much must be known of what is not part of its largest planes.
+        """
+        details = beside_planes(seen.patches)
+        if len(details.points) < MIN_PATCHES:
+            return "all of it lies on a few planes, such as any corner of a room"
+        level = self._map.levels(details)[DETAILS]
+        level(T)
+        few = level.known < known
+        return f"{level.known:.0%} of what is not on its largest planes is known, {known:.0%} is needed" if few else ""
 
     def contradicted(self, seen: Seen, T: Transform) -> str:
         """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""

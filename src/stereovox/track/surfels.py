@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from stereovox.frame import DepthImage
 from stereovox.se3 import Transform
 from stereovox.track._surfels import EMPTY, FIELDS, carry, drop, equations, nearest, normals, patches, put
+from stereovox.track.fit import Fit, Stage, settled
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -41,6 +43,13 @@ QUIETEST = 0.01
 """Least variance of residuals, as a share of the expected one, that is believed."""
 BENT = 0.05
 """Radians by which normals of a plane may be bent together, by the camera's own distortion: that holds nothing."""
+ELDER, LAG = 1, 30
+"""Which of the sizes surfels have that are not younger than so many images, and that many."""
+OWN = np.diag(np.repeat([0.1, 0.1], 3) ** 2)
+"""Covariance of where those may ask a pose to be: wide."""
+PLANES, PLANE, GUESSES, ALONG, THICK_M = 5, 0.04, 60, np.float32(0.94), np.float32(0.04)
+"""Largest planes of a view: how many, their least share of it, how many are tried, the least cosine of normals and the
+half thickness in metres of one."""
 FIRST = 1 << 14
 """Places in a new table."""
 
@@ -73,6 +82,22 @@ def patches_of(image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre:
     away = np.linalg.norm(point, axis=2)
     row = np.minimum(away[there] * rows_per_metre, len(sigma_of) - 1).astype(int)
     return Patches(point[there], normal[there], sigma_of[row].astype(np.float32))
+
+
+def beside_planes(seen: Patches) -> Patches:
+    """Return the patches of an image that do not lie on its largest planes: floor, walls, ceiling."""
+    few = seen.thinned(2)
+    offset = np.einsum("ni,ni->n", few.points, few.normals)
+    left = np.ones(len(few.points), bool)
+    for _ in range(PLANES):
+        tried = np.flatnonzero(left)[:: max(1, int(left.sum()) // GUESSES)]
+        on = left & (few.normals[tried] @ few.normals.T > ALONG)
+        on &= np.abs(few.normals[tried] @ few.points.T - offset[tried, None]) < THICK_M + few.sigma
+        number = on.sum(axis=1)
+        if not len(number) or number.max() < PLANE * len(left):
+            break
+        left &= ~on[number.argmax()]
+    return Patches(*(np.ascontiguousarray(part[left]) for part in few))
 
 
 class Surfels:
@@ -154,6 +179,34 @@ class SurfelMap:
         """
         sizes = zip(self._levels, SLACK, EVERY, strict=True)
         return [Level(level, slack, seen.thinned(every), quietest) for level, slack, every in sizes]
+
+
+class Elders:
+    """Surfels of what was learned a while ago, by which poses on newer ones are checked.
+
+    Something that moves takes surfels along that were learned from it just now, but none of these.
+    """
+
+    def __init__(self) -> None:
+        self._surfels, self._number = Surfels(SIZES[ELDER]), 0
+        self._waiting: deque[tuple[Patches, Transform]] = deque()
+
+    def add(self, seen: Patches, T_map_camera: Transform) -> None:
+        """Add the patches of an image, once `LAG` others have come; at first as many as came before."""
+        self._waiting.append((seen.thinned(2), T_map_camera))
+        self._number += 1
+        while len(self._waiting) > min(LAG, self._number / 2):
+            self._surfels.add(*self._waiting.popleft())
+
+    def forget(self, centre: NDArray[np.float64], radius: float) -> None:
+        """Drop all surfels farther than `radius` metres from `centre` (3,) along an axis."""
+        self._surfels.forget(centre, radius)
+
+    def fit(self, seen: Patches, T_map_camera: Transform) -> Fit:
+        """Return the pose that they ask for, near one; with a wide covariance where they hold none."""
+        level = Level(self._surfels, SLACK[ELDER], seen.thinned(SAMPLED), 1.0)
+        T, covariance = settled([Stage(level, CONVERGED * level.size)], T_map_camera, OWN)
+        return Fit(T, covariance, level.known, level.usual)
 
 
 class Level:

@@ -46,8 +46,15 @@ SHORTEST = 0.3
 TURNED_AWAY = np.radians(20)
 """Angle between an image that is found again and what a trusted gyroscope says, beyond four times its doubt: another
 place that looks alike."""
-RIVAL, RIVAL_M, RIVAL_RAD = 0.9, 0.3, np.radians(15)
+RIVAL, RIVAL_M, RIVAL_RAD = 0.5, 0.3, np.radians(15)
 """Two fits of which one explains this share of what the other does, so far apart: neither is believed."""
+SOON, NEAR_M, NEAR_RAD = 90.0, 1.2, np.radians(60)
+"""Times the usual, until when an image that fits this near the last pose that counted is there, and nowhere else that
+looks alike."""
+STAYS = 0.7
+"""Share of what must be known of an image that is found again that must be known of those that confirm it."""
+LEAP_M, LEAP_RAD, FINE = 0.1, np.radians(4), 0.92
+"""How far a pose may leave the expected one, unless so much of what is known roughly is known closely too."""
 FIRST = 3.0
 """Times the usual spread, from the first image to the second: the camera may be moving."""
 REMEMBERED = 8
@@ -63,8 +70,8 @@ class Demand(NamedTuple):
     usual: float
 
 
-FOLLOWING, RETURNING, FOUND = Demand(0.2, 0.6), Demand(0.5, 0.8), Demand(0.75, 0.8)
-"""Of an image that follows the one before, that comes late or soon after a loss, and that is found again later.
+FOLLOWING, RETURNING, NEARBY, FOUND = Demand(0.2, 0.6), Demand(0.5, 0.8), Demand(0.35, 0.8), Demand(0.75, 0.8)
+"""Of an image that follows the one before, that comes late, that is found again soon and near, and later or farther.
 
 Long after a loss the camera may be anywhere, and two stretches of an aisle that are alike share walls and floor: two
 thirds of what is seen.
@@ -113,6 +120,17 @@ class Evidence(Protocol[Seen]):
 
     def seek(self, seen: Seen, last: Transform, /) -> list[Fit]:
         """Return how an image fits at places that were seen before; the last pose that was known."""
+        ...
+
+    def doubted(self, seen: Seen, fit: Fit, /) -> str:
+        """Return what speaks against the pose of an image that follows, "" where nothing does."""
+        ...
+
+    def ambiguous(self, seen: Seen, T: Transform, known: float, /) -> str:
+        """Return why an image may be from another place that is like that at T_map_camera, "" where it is not.
+
+        known: share that must be known of what tells places apart.
+        """
         ...
 
     def contradicted(self, seen: Seen, T: Transform, /) -> str:
@@ -194,7 +212,7 @@ class Tracker:
         self._sensor = ""
         self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
         self._stamps: list[int] = []  # of the last images that were followed
-        self._learned = 0
+        self._learned, self._sure = 0, np.eye(4)  # the last pose that counted
         self._adrift = False  # followed, though open along some direction
         self._counted = False  # whether the pose of the last image that was followed did
         self._near_ns, self._back = -1, FOUND  # until when the camera cannot be far from its last pose; demand then
@@ -313,7 +331,7 @@ class Tracker:
         if later > GAP:
             demand = RETURNING
         if self._trial and not self._adrift:
-            demand = self._back
+            demand = self._back._replace(known=STAYS * self._back.known)
         guess, *others = self._guesses(evidence.limits, stamp_ns, later, turn)
         fit, why = _followed(evidence, seen, guess, demand)
         if why and others:
@@ -332,8 +350,8 @@ class Tracker:
             evidence.advance(seen, self._T)
             return self._lost(why)
         evidence.learn(seen, self._T)
-        self._learned += 1
-        self._near_ns = stamp_ns + round(LONGEST * self._usual())
+        self._learned, self._sure = self._learned + 1, self._T
+        self._near_ns = stamp_ns + round(SOON * self._usual())
         return self._found()
 
     def _turn(self, stamp_ns: int) -> Turn | None:
@@ -406,29 +424,46 @@ class Tracker:
         fits = sorted(evidence.seek(seen, last), key=lambda fit: -fit.known * fit.usual)
         if not fits:
             return self._lose("not found again: it looks like nothing before")
-        best = fits[0]
         if stamp_ns < self._stamps[-1]:
             self._near_ns = -1  # another clock, or a recording that begins again: nobody knows how long it took
-        self._back = RETURNING if stamp_ns <= self._near_ns else FOUND
-        why = _doubt(best, self._back) or _open(best, evidence.limits.unsure)
-        rivals = (fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual)
-        if not why and any(far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD) for fit in rivals):
+        said = [self._refused(evidence, seen, fit, stamp_ns, last, reach) for fit in fits]
+        best, why = next(((fit, why) for fit, why in zip(fits, said, strict=True) if not why), (fits[0], said[0]))
+        rivals = [fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual and fit.fine >= FINE]
+        apart = [fit for fit in rivals if far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD)]
+        if not why and any(not evidence.contradicted(seen, fit.T_map_camera) for fit in apart):
             why = "it fits at several places"
-        if not why and far_apart(last, best.T_map_camera, np.inf, reach):
-            why = "it fits where, by the gyroscope, the camera does not look"
-        why = why or evidence.contradicted(seen, best.T_map_camera)
         if why:
             return self._lose(f"not found again: {why}")
+        self._back = self._demand(best, stamp_ns)
         self._place(best.T_map_camera, best.covariance)
         self._motion, self._stamps, self._trial, self._counted = np.eye(4), [stamp_ns], CONFIRMED, False
         evidence.advance(seen, self._T)
         return self._lost(f"found again; {CONFIRMED} more images must agree")
 
+    def _demand(self, fit: Fit, stamp_ns: int) -> Demand:
+        """Return what must be known of an image that fits at a place, by whether the camera can be elsewhere by now."""
+        if stamp_ns <= self._near_ns and not far_apart(self._sure, fit.T_map_camera, NEAR_M, NEAR_RAD):
+            return NEARBY
+        return FOUND
+
+    def _refused(
+        self, evidence: Evidence[Seen], seen: Seen, fit: Fit, stamp_ns: int, last: Transform, reach: float
+    ) -> str:
+        """Return why an image is not believed to be where it fits, "" where it is; last, reach: as of `_turned`."""
+        demand, T = self._demand(fit, stamp_ns), fit.T_map_camera
+        why = _doubt(fit, demand) or _open(fit, evidence.limits.unsure)
+        if not why and far_apart(last, T, np.inf, reach):
+            why = "it fits where, by the gyroscope, the camera does not look"
+        if not why and fit.fine < FINE:
+            why = f"only {fit.fine:.0%} of it fits closely"
+        why = why or evidence.doubted(seen, fit) or evidence.contradicted(seen, T)
+        return why or ("" if demand is NEARBY else evidence.ambiguous(seen, T, demand.known))
+
     def _turned(self, stamp_ns: int) -> tuple[Transform, float]:
         """Return the last pose, turned as a trusted gyroscope says, and by how many radians that may be off."""
         turn = self._turn(stamp_ns)
         if self._gyroscope is None or turn is None or not self._gyroscope.trusted:
-            return self._T, np.inf
+            return self._sure, np.inf
         T = self._T.copy()
         T[:3, :3] = T[:3, :3] @ turn.R
         return T, TURNED_AWAY + 4 * float(np.sqrt(np.trace(self._gyroscope.doubt(turn))))
@@ -468,10 +503,17 @@ def _seen(evidence: Evidence[Seen], frame: AnyFrame) -> Seen:
 def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand) -> tuple[Fit, str]:
     """Return how an image fits near a guess, and why it does not, "" where it does."""
     fit = evidence.fit(seen, *guess)
-    why = _doubt(fit, demand) or _open(fit, evidence.limits.adrift)
+    why = _doubt(fit, demand) or _open(fit, evidence.limits.adrift) or _leap(fit, guess)
+    why = why or evidence.doubted(seen, fit)
     if not why and demand is not FOLLOWING:
         why = evidence.contradicted(seen, fit.T_map_camera)
     return fit, why
+
+
+def _leap(fit: Fit, guess: Guess) -> str:
+    """Return that an image does not fit closely where it leaves what was expected by far, "" otherwise."""
+    far = far_apart(guess[0], fit.T_map_camera, LEAP_M, LEAP_RAD)
+    return f"only {fit.fine:.0%} of it fits closely, off from even motion" if far and fit.fine < FINE else ""
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:

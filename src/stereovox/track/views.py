@@ -9,7 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from stereovox.se3 import Transform, inverse, rotation_vector
+from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector
+from stereovox.track import _views
 
 GRID = (30, 40)
 """Rows and columns of a view's depths."""
@@ -21,6 +22,11 @@ WIDEST = 4.0
 """Half width and half height of the grid at one metre, at most: of a camera that sees farther aside, what is ahead."""
 TOLERANCE = 0.04
 """Share of the depth by which what is seen twice may differ, besides four standard deviations."""
+DEVIATIONS, SLACK = np.float32(4), np.float32(TOLERANCE)
+EDGE, SAME = 3, 0.06
+"""Places of the grid around what moves that move with it, where their depths differ by no more than this share."""
+TURNED_M = 2.0
+"""Metres that a view counts as farther away where it looks across; twice as many where it looks back."""
 
 
 class View(NamedTuple):
@@ -63,20 +69,39 @@ def stood_free(
     """
     free = np.zeros(len(points), bool)
     for view in nearest_views(views, T, FEW):
-        T_view_camera = inverse(view.T) @ T
-        there = points @ T_view_camera[:3, :3].T + T_view_camera[:3, 3]
-        row, column, inside = _places(view, there)
-        seen = view.nearest[row[inside], column[inside]]
-        slack = 4 * sigma[inside] + TOLERANCE * np.where(np.isfinite(seen), seen, 0)
-        free[inside] |= np.isfinite(seen) & (there[inside, 2] < seen - slack)
+        _views.stood_free(points, sigma, *_into(view, T), view.nearest, DEVIATIONS, SLACK, free)
     return free
 
 
+def with_edges(free: NDArray[np.bool_], points: NDArray[np.float32], T: Transform) -> NDArray[np.bool_]:
+    """Return which points (N, 3) of an image are free (N,), or lie next to such on what seems to be the same thing.
+
+    Views have holes, and their depths are coarse: of a person who walks in, parts stand where nobody looked before.
+    """
+    view = view_of(points, np.zeros(len(points), np.float32), T)
+    row, column, inside = _places(view, points)
+    moving = np.full(GRID, np.nan)
+    moving[row[inside & free], column[inside & free]] = points[inside & free, 2]
+    for _ in range(EDGE):
+        around = sliding_window_view(np.pad(moving, 1, constant_values=np.nan), (3, 3)).reshape(*GRID, 9)
+        apart = np.abs(around - view.depth[..., None]) < SAME * view.depth[..., None]
+        moving = np.where(np.isnan(moving) & apart.any(axis=2), view.depth, moving)
+    there = np.where(inside, moving[np.where(inside, row, 0), np.where(inside, column, 0)], np.nan)
+    return free | (np.abs(there - points[:, 2]) < SAME * points[:, 2])
+
+
+def passed_through(here: View, views: list[View], number: int, step: int = 1) -> float:
+    """Return the share of what the nearest views saw and an image sees again that the image looks through."""
+    found = np.array([_seen_through(view, here, DEVIATIONS, step) for view in nearest_views(views, here.T, number)])
+    return float(found[:, 0].sum() / max(found.sum(), 1)) if len(found) else 0.0
+
+
 def nearest_views(views: list[View], T: Transform, number: int) -> list[View]:
-    """Return the views from nearest to a pose."""
+    """Return the views that are nearest to a pose, in metres and by where they look (`TURNED_M`)."""
     if len(views) <= number:
         return views
-    away = np.linalg.norm(np.array([view.T[:3, 3] for view in views]) - T[:3, 3], axis=1)
+    poses = np.array([view.T[:3, 2:] for view in views])
+    away = np.linalg.norm(poses[:, :, 1] - T[:3, 3], axis=1) + TURNED_M * (1 - poses[:, :, 0] @ T[:3, 2])
     return [views[i] for i in np.argsort(away, kind="stable")[:number]]
 
 
@@ -100,6 +125,16 @@ def far_apart(one: Transform, other: Transform, metres: float, radians: float) -
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) > metres or turn > radians)
 
 
+def turned(T: Transform, angles: NDArray[np.float64]) -> list[Transform]:
+    """Return a camera's pose turned aside by angles in radians, about the axis that points down in its image."""
+    out = []
+    for angle in angles:
+        aside = np.eye(4)
+        aside[:3, :3] = rotation_matrix([0.0, angle, 0.0])
+        out.append(T @ aside)
+    return out
+
+
 def contradiction(seen: View, views: list[View], deviations: float = 4.0) -> tuple[float, int]:
     """Return the share of what is seen twice that lies where a view looked through, and how many places are seen twice.
 
@@ -110,14 +145,18 @@ def contradiction(seen: View, views: list[View], deviations: float = 4.0) -> tup
     return through / max(through + same, 1), int(through + same)
 
 
-def _seen_through(one: View, other: View, deviations: float) -> tuple[int, int]:
-    """Return how many points of one view the other looks through, and how many it sees as well."""
-    T = inverse(other.T) @ one.T
-    points = one.points @ T[:3, :3].T + T[:3, 3]
-    row, column, inside = _places(other, points)
-    z, seen = points[inside, 2], other.depth[row[inside], column[inside]]
-    slack = deviations * one.sigma[inside] + TOLERANCE * seen
-    return int((z < seen - slack).sum()), int((np.abs(z - seen) <= slack).sum())
+def _seen_through(one: View, other: View, deviations: float, step: int = 1) -> tuple[int, int]:
+    """Return how many points of one view the other looks through, and how many it sees as well; every `step`th."""
+    found = np.zeros(2, np.int64)
+    into = _into(other, one.T)
+    _views.seen_through(one.points, one.sigma, *into, other.depth, np.float32(deviations), SLACK, step, found)
+    return int(found[0]), int(found[1])
+
+
+def _into(view: View, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotation and shift from a camera at T_map_camera into a view's, and the view's slope."""
+    T_view_camera = inverse(view.T) @ T
+    return np.ascontiguousarray(T_view_camera[:3, :3]), np.ascontiguousarray(T_view_camera[:3, 3]), view.slope
 
 
 def _places(view: View, points: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:

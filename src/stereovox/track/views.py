@@ -92,7 +92,9 @@ def with_edges(free: NDArray[np.bool_], points: NDArray[np.float32], T: Transfor
 
 def passed_through(here: View, views: list[View], number: int, step: int = 1) -> float:
     """Return the share of what the nearest views saw and an image sees again that the image looks through."""
-    found = np.array([_seen_through(view, here, DEVIATIONS, step) for view in nearest_views(views, here.T, number)])
+    found = np.array(
+        [_seen_through(view, here, float(DEVIATIONS), step) for view in nearest_views(views, here.T, number)]
+    )
     return float(found[:, 0].sum() / max(found.sum(), 1)) if len(found) else 0.0
 
 

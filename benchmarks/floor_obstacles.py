@@ -36,6 +36,8 @@ from stereovox.simulate.simulation import Simulation
 BAND = (0.1, 1.8)
 MARGIN = 0.005
 """Metres by which an obstacle must reach into the band."""
+LOWER = (0.1, 1.2)
+"""The same for a robot of 1.2 m."""
 PLACES = (np.arange(4) + 0.5) / 4
 Height = Callable[[NDArray], NDArray]
 
@@ -202,7 +204,7 @@ class Truth:
     lost: NDArray
 
 
-def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray) -> Truth:
+def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray, band: tuple[float, float] = BAND) -> Truth:
     """Return what the columns of a map of a world truly are, as far as the map knows anything of them."""
     side = voxel_map.voxel_size
     low, high = (np.rint(end / side).astype(int) for end in voxel_map.bounds())
@@ -215,12 +217,12 @@ def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray) -> Truth:
         for place in product(PLACES, PLACES):
             x, y = ((columns[near] + place) * side + origin[:2]).T
             base, (bottom, top) = world.floor(x), _through(solid, x, y)
-            obstacle[near] |= (bottom < base + BAND[1]) & (top > base + BAND[0] + MARGIN) & (bottom < top)
+            obstacle[near] |= (bottom < base + band[1]) & (top > base + band[0] + MARGIN) & (bottom < top)
             inside[near] |= (solid.part == "floor") & (bottom < top)
     middle = (columns + 0.5) * side
     base = world.floor(middle[:, 0] + origin[0]) - origin[2]
     known, seen_floor, lost = np.zeros(len(columns), bool), np.zeros(len(columns), bool), np.ones(len(columns), bool)
-    for above in np.arange(BAND[0] + side / 2, BAND[1], side):
+    for above in np.arange(band[0] + side / 2, band[1], side):
         state = voxel_map.state(np.column_stack([middle, base + above]))
         known |= state != sv.State.UNKNOWN
         lost &= state == sv.State.FREE
@@ -280,7 +282,7 @@ def kitchen(folder: str) -> None:
     for name, settings in {"levelled": {"level": True}, "tracked": {"poses": "track"}}.items():
         with TemporaryDirectory() as place:
             found = sv.map_recording(folder, Path(place) / "map.svox", **settings).map
-            for heights in (BAND, (0.1, 1.2)):
+            for heights in (BAND, LOWER):
                 truth = truth_of_plane(found, heights)
                 print(f"{Path(folder).name}, {name}, {heights[0]:g} to {heights[1]:g} m", flush=True)
                 print(
@@ -335,11 +337,11 @@ def main() -> None:
     totals = {name: Score(0, 0, 0, 0, 0) for name in ("before", "now", "now, 0.1 to 1.2 m")}
     for world, camera, side, seed in worlds(range(options.first, options.first + options.seeds), options.places):
         voxel_map, origin = mapped(world, camera, side, seed)
-        truth = truth_of(voxel_map, world, origin)
-        grids = (before(voxel_map), project(voxel_map), project(voxel_map, (BAND[0], 1.2)))
+        truth, lower = (truth_of(voxel_map, world, origin, band) for band in (BAND, LOWER))
+        cases = ((before(voxel_map), truth), (project(voxel_map), truth), (project(voxel_map, LOWER), lower))
         print(f"{world.name}, {camera}, seed {seed}")
-        for name, grid in zip(totals, grids, strict=True):
-            found = score(grid, truth)
+        for name, case in zip(totals, cases, strict=True):
+            found = score(*case)
             totals[name] += found
             print(f"  {name:18} {found}", flush=True)
     for name, total in totals.items():

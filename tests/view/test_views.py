@@ -200,3 +200,12 @@ def test_a_saved_map_remembers_its_camera(tmp_path):
     assert again.camera == CAMERA
     assert again.stamp_ns == 5
     np.testing.assert_array_equal(again.T_world_camera, one.viewpoint.T_world_camera)
+
+
+def test_a_picture_gives_the_numbers_of_the_map_itself(monkeypatch):
+    """A map that is turned upright for the picture has other cells; the heading counts those of `info`."""
+    turned, itself = (VoxelMap.from_cells(load_config(), [[k, 0, 0] for k in range(n)], [3.0] * n) for n in (9, 5))
+    for name in ("overview", "space", "layer"):
+        texts = [text.get_text() for text in draw_view(turned, name, "a map", "z", counted=itself).texts]
+        assert any("5 occupied" in text for text in texts)
+        assert not any("9 occupied" in text for text in texts)

@@ -91,15 +91,15 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
 
     arguments.view = arguments.view or "overview"
     _check_options(arguments)
-    voxel_map = open_cubes(arguments.map)
+    voxel_map = counted = open_cubes(arguments.map)
     if arguments.up is None and voxel_map.config.up_direction is not None:
         voxel_map = levelled(voxel_map)
         heading = heading if arguments.title else f"{heading}, turned upright"
-        say("note: turned upright for the picture: its axes and numbers of cells are not those of the map itself")
+        say("note: turned upright for the picture: its axes are not those of the map itself")
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     if arguments.width_mm is None:
-        drawn = draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint)
+        drawn = draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint, counted)
     else:
         drawn = draw_paper(voxel_map, arguments.view, up, arguments.width_mm, arguments.at, viewpoint)
     if arguments.at is not None:

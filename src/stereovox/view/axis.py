@@ -21,12 +21,16 @@ BEYOND = 6
 
 
 def draw_axis(
-    voxel_map: VoxelMap, heading: str, length_m: float | None = None, viewpoint: Viewpoint | None = None
+    voxel_map: VoxelMap,
+    heading: str,
+    length_m: float | None = None,
+    viewpoint: Viewpoint | None = None,
+    counted: VoxelMap | None = None,
 ) -> Any:
     """Return a figure of the log-odds of the cells along the camera's optical axis.
 
     length_m: length of the axis; by default the map's `max_range`. viewpoint: by default the map's last.
-    Raises StereovoxError where the camera is not known.
+    counted: as for `draw_view`. Raises StereovoxError where the camera is not known.
     """
     figure = figure_of(6.5)
     axis = figure.add_subplot()
@@ -34,7 +38,7 @@ def draw_axis(
     reached = "no cell is occupied" if hit is None else f"first occupied from {hit[0]:.2f} to {hit[1]:.2f} m"
     title(axis, f"Along the optical axis: {reached}")
     axis.legend(loc="lower right", bbox_to_anchor=(1.005, 1), ncols=4, frameon=False, fontsize=10, borderaxespad=0.3)
-    headline(figure, voxel_map, heading)
+    headline(figure, counted or voxel_map, heading)
     return figure
 
 

@@ -25,12 +25,18 @@ MAX_SQUARES = 90
 
 
 def draw_layer(
-    voxel_map: VoxelMap, heading: str, up: str, at_m: float | None = None, viewpoint: Viewpoint | None = None
+    voxel_map: VoxelMap,
+    heading: str,
+    up: str,
+    at_m: float | None = None,
+    viewpoint: Viewpoint | None = None,
+    counted: VoxelMap | None = None,
 ) -> Any:
     """Return a figure of one layer: states, log-odds as colours, log-odds as a landscape, and along the optical axis.
 
     at_m: height in metres along `up`; by default the camera's, or that of the most informative layer without one.
-    viewpoint: by default the map's last. Raises StereovoxError for an empty map or an invalid `up`.
+    viewpoint: by default the map's last. counted: as for `draw_view`.
+    Raises StereovoxError for an empty map or an invalid `up`.
     """
     viewpoint = viewpoint or voxel_map.viewpoint
     up = checked_up(up)
@@ -47,7 +53,7 @@ def draw_layer(
     if viewpoint is not None:
         draw_profile(figure.add_subplot(below[1]), voxel_map, None, viewpoint)
     keep_clear(plan)
-    headline(figure, voxel_map, heading)
+    headline(figure, counted or voxel_map, heading)
     return figure
 
 

@@ -41,9 +41,16 @@ def picture(
     save(draw(voxel_map, heading=title or "Occupancy map", trajectory=trajectory, up=up), path)
 
 
-def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = None, up: str = "z") -> Any:
-    """Return the matplotlib figure that `picture` saves."""
-    voxel_map = voxel_map.overview()
+def draw(
+    voxel_map: VoxelMap,
+    *,
+    heading: str,
+    trajectory: ArrayLike | None = None,
+    up: str = "z",
+    counted: VoxelMap | None = None,
+) -> Any:
+    """Return the matplotlib figure that `picture` saves; `counted` is the map whose numbers it gives, if another."""
+    counted, voxel_map = counted or voxel_map, voxel_map.overview()
     drawn = upright(voxel_map, camera_path(voxel_map) if trajectory is None else trajectory, up)
     if not len(drawn.cells):
         figure = _note("This map is empty: no cell is known yet.")
@@ -51,7 +58,7 @@ def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = No
         figure = _only_slice(drawn)
     else:
         figure = _page(drawn)
-    headline(figure, voxel_map, heading, _about_path(drawn))
+    headline(figure, counted, heading, _about_path(drawn))
     return figure
 
 

@@ -103,11 +103,17 @@ def _text(
                   fontsize=size, color=GREY, rotation=turn, annotation_clip=False)  # fmt: skip
 
 
-def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint | None = None) -> Any:
+def draw_space(
+    voxel_map: VoxelMap,
+    heading: str,
+    up: str,
+    viewpoint: Viewpoint | None = None,
+    counted: VoxelMap | None = None,
+) -> Any:
     """Return a figure of the occupied cells, seen from behind the camera and above, with its field of view in red.
 
     viewpoint: by default the map's last; without any the lines are left out. A ceiling is hidden.
-    Raises StereovoxError for a map without occupied cells or an invalid `up`.
+    counted: as for `draw_view`. Raises StereovoxError for a map without occupied cells or an invalid `up`.
     """
     up = checked_up(up)
     viewpoint = viewpoint or voxel_map.viewpoint
@@ -123,7 +129,7 @@ def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint 
     cut = "" if drawn.cut is None else f", cut open at {drawn.names[2]} = {drawn.cut:.2f} m"
     seen = "" if lines is None else f"; red: the camera and its field of view, {FIELD_M:g} m deep, dashed behind cells"
     title(axis, f"Occupied cells{cut}{seen}")
-    headline(figure, voxel_map, heading)
+    headline(figure, counted or voxel_map, heading)
     return figure
 
 

@@ -24,20 +24,23 @@ def draw_view(
     up: str,
     at_m: float | None = None,
     viewpoint: Viewpoint | None = None,
+    counted: VoxelMap | None = None,
 ) -> Any:
     """Return the matplotlib figure of one view of a map.
 
     overview: from above, from three sides, and a slice. layer: one layer across `up`, at height `at_m` along it or at
     the camera's. axis: log-odds along the optical axis. space: cells and field of view in space. viewpoint: by default
-    the map's last. Raises StereovoxError for an unknown view, or where the view needs a camera that is not known.
+    the map's last. counted: the map itself, whose numbers the heading gives, if `voxel_map` was turned for the picture.
+    Raises StereovoxError for an unknown view, or where the view needs a camera that is not known.
     """
+    counted = counted or voxel_map  # before it is made coarser
     up, voxel_map = checked_up(up), voxel_map.overview()
     if view == "overview":
-        return draw(voxel_map, heading=heading, up=up)
+        return draw(voxel_map, heading=heading, up=up, counted=counted)
     if view == "layer":
-        return draw_layer(voxel_map, heading, up, at_m, viewpoint)
+        return draw_layer(voxel_map, heading, up, at_m, viewpoint, counted)
     if view == "axis":
-        return draw_axis(voxel_map, heading, None, viewpoint)
+        return draw_axis(voxel_map, heading, None, viewpoint, counted)
     if view == "space":
-        return draw_space(voxel_map, heading, up, viewpoint)
+        return draw_space(voxel_map, heading, up, viewpoint, counted)
     raise StereovoxError(f"unknown view '{view}'{did_you_mean(view, VIEWS)}")

@@ -186,10 +186,20 @@ def test_a_place_below_a_drop_is_not_free():
     dock = Place(lambda x: 0 if x < 50 else -12)
     grid = project(dock.map(), start=(1.0, 1.0, 0.0))  # the robot is on the dock
     assert (states_in(grid, (5, 5), (40, 45)) == State.FREE).all()
-    assert (states_in(grid, (55, 5), (75, 45)) != State.FREE).all()
+    assert (states_in(grid, (50, 5), (75, 45)) != State.FREE).all()  # from the edge on
+    low_box = dock.box((51, 10, -12), (54, 40, 2))  # lower than a step above the dock
+    grid = project(low_box.map(), start=(1.0, 1.0, 0.0))
+    assert (states_in(grid, (50, 5), (75, 45)) != State.FREE).all()
     below = project(dock.map())  # the lowest: the dock is an obstacle
     assert (states_in(below, (0, 0), (40, 50)) != State.FREE).all()
     assert (states_in(below, (65, 5), (75, 45)) == State.FREE).all()
+
+
+def test_a_box_as_high_as_another_floor_is_no_island_of_it():
+    place = Place(lambda x: 0 if x < 50 else -4).unseen((50, 0, -4), (54, 50, 21)).box((58, 20, -4), (63, 26, 1))
+    grid = project(place.map(), start=(1.0, 1.0, 0.0))  # the robot is on the higher floor
+    assert (states_in(grid, (58, 20), (63, 26)) != State.FREE).all()
+    assert (states_in(grid, (5, 5), (45, 45)) == State.FREE).all()
 
 
 def test_where_the_floor_was_not_seen_nearby_nothing_is_free():

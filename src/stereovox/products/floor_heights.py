@@ -37,7 +37,8 @@ class FloorHeights:
     Attributes:
         height: (rows, columns) float32, metres along the map's `up` from the world's origin: of the nearest floor that
             was seen. NaN if there is none at all.
-        away: (rows, columns) float32, horizontal metres to that floor; 0 where it was seen itself.
+        away: (rows, columns) float32, horizontal metres to that floor; 0 where it was seen itself, infinite where free
+            space lies deeper, as beyond the edge of a drop.
         resolution: Side of a cell in metres.
         origin: x, y, yaw of the corner of cell (0, 0), in the axes of `projection.project`.
         up: The axis of the map that points up.
@@ -218,11 +219,14 @@ def find_floor(voxel_map: VoxelMap, start: ArrayLike | None = None) -> FloorHeig
     floor, viewpoint = floor_of(voxel_map), voxel_map.viewpoint
     here = None if start is None else place_of(floor, start)
     camera = None if viewpoint is None else place_of(floor, viewpoint.T_world_camera[:3, 3])
-    levels = FloorSearch(floor, here, camera).levels()
+    search = FloorSearch(floor, here, camera)
+    levels = search.levels()
     if (levels == NO_SURFACE).all():
         return FloorHeights.unknown(voxel_map.config.up)
     away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
-    height = (median_filter(levels[tuple(nearest)], SMOOTHED, mode="nearest") - 0.5) * floor.side
+    filled = levels[tuple(nearest)]
+    away[(levels == NO_SURFACE) & search.drops(filled)] = np.inf
+    height = (median_filter(filled, SMOOTHED, mode="nearest") - 0.5) * floor.side
     return FloorHeights(
         height.astype(np.float32), (away * floor.resolution).astype(np.float32), floor.resolution, floor.origin,
         voxel_map.config.up,

@@ -38,6 +38,8 @@ COVERED = 0.5
 """A floor of which such a part near the camera lies under another floor below the camera is another storey."""
 DEEP, RIM, HOLLOW = 0.3, 1.0, 0.5
 """No floor has, within RIM metres, HOLLOW times as many columns as its own with free cells DEEP metres lower."""
+BESIDE_M, MOST_DEEP = 0.25, 0.3
+"""A small surface is no floor if at more than such a part of it free space lies deeper within so many metres."""
 ROUNDS = 4
 """Most steps of a floor beyond gaps."""
 
@@ -73,7 +75,8 @@ class FloorSearch:
         if first is None:
             return np.full(self._floor.shape, NO_SURFACE, np.int64)
         levels = one_level(self._floor.shape, surfaces[group == first], self._here)
-        allowed = np.where(self._large(group, AREA), self._step, self._climb)
+        large = self._large(group, AREA)
+        allowed = np.where(large, self._step, np.where(self._stands(surfaces, group), -1, self._climb))
         for _ in range(ROUNDS):
             before = np.count_nonzero(levels == NO_SURFACE)
             self._add_islands(levels, surfaces, group, allowed)
@@ -97,6 +100,15 @@ class FloorSearch:
             if not self._is_covered(surfaces[near & (group == one)], surfaces[near]) and not self._is_hollow(mine):
                 return one
         return None
+
+    def _stands(self, surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return which groups stand above something lower: a box beside a floor that is as high as its top."""
+        from scipy.ndimage import minimum_filter
+
+        window = 2 * max(1, round(BESIDE_M / self._floor.resolution)) + 1
+        lowest = minimum_filter(self._lowest_free, window, mode="nearest")[tuple(surfaces[:, :2].T)]
+        deep = (lowest < surfaces[:, 2] - 1 - self._step).astype(float)
+        return np.bincount(group, deep) > MOST_DEEP * np.bincount(group)
 
     def _large(self, group: NDArray[np.int32], area: float) -> NDArray[np.bool_]:
         """Return which groups have at least `area` square metres."""
@@ -128,6 +140,10 @@ class FloorSearch:
         depth = (levels[tuple(nearest)] - self._lowest_free) * self._floor.side - STEEPEST * run
         hollow = (run > 0) & (run <= RIM) & (depth > DEEP)
         return bool(np.count_nonzero(hollow) > HOLLOW * np.count_nonzero(levels != NO_SURFACE))
+
+    def drops(self, height: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return where free space lies deeper than a step below a floor at levels (rows, columns): it is not there."""
+        return self._lowest_free < height - 1 - self._step
 
     @cached_property
     def _lowest_free(self) -> NDArray[np.int64]:

@@ -122,15 +122,13 @@ class Comparison:
         tolerance = np.maximum(voxel_map.voxel_size, self._noise[image.camera].sigma(np.linalg.norm(points, axis=1)))
         placed = _placed(voxel_map, T, points, tolerance)
         against = placed.against
-        known = np.count_nonzero(placed.agrees | against)
-        anchored = np.count_nonzero(placed.agrees) / known if known >= max(FEW, KNOWN * len(points)) else None
+        known = int((placed.agrees | against).sum())
+        anchored = float(placed.agrees.sum()) / known if known >= max(FEW, KNOWN * len(points)) else None
         votes, frames = Votes(), 0
         if doubt is not None and doubt.glance is not None:
             votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
         fault = _fault(voxel_map, image, points, tolerance, placed, align=frames % EVERY == 0)
-        return Sight(
-            anchored, fault, np.count_nonzero(against), np.count_nonzero(placed.behind), votes, Glance.at(seen, T)
-        )
+        return Sight(anchored, fault, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
 
 
 class Placed(NamedTuple):
@@ -150,7 +148,8 @@ class Placed(NamedTuple):
 def _placed(voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
     """Return where points (N, 3) in the sensor's frame lie in the map."""
     if not len(points):
-        return Placed(*(np.zeros(0, bool),) * 3, np.zeros(0))
+        none = np.zeros(0, bool)
+        return Placed(none, none, none, np.zeros(0))
     rays = points @ T[:3, :3].T
     away = np.linalg.norm(points, axis=1)
     agrees = _on_surface(voxel_map, T, points, tolerance)
@@ -170,7 +169,7 @@ def _on_surface(
     step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
     tries = np.stack([points * (1 - step), points, points * (1 + step)])
     placed = tries.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
-    return (voxel_map.state(placed).reshape(tries.shape[:-1]) >= State.TENTATIVE).any(axis=0)
+    return np.any(voxel_map.state(placed).reshape(tries.shape[:-1]) >= State.TENTATIVE, axis=0)
 
 
 def _fault(
@@ -242,7 +241,7 @@ def _sampled(image: AnyImage, most: int) -> NDArray[np.float64]:
     step = max(1, round((image.depth_m.size / most) ** 0.5))
     rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
     points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-    return points[np.isfinite(points).all(axis=1)]
+    return points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
 
 
 def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:

@@ -104,7 +104,8 @@ def _depth(change: Callable[[Depth, np.random.Generator], Depth]) -> Fault:
             seen = change(frame.depth, bad.random)
             return replace(frame, depth=np.ascontiguousarray(seen, np.float32), reason=None)
         ranges = np.linalg.norm(frame.points, axis=1).reshape(len(RINGS), len(TURN))[::-1].astype(np.float32)
-        seen = change(np.where(np.isfinite(ranges), ranges, 0), bad.random)[::-1].reshape(-1, 1)
+        ranges[~np.isfinite(ranges)] = 0
+        seen = change(ranges, bad.random)[::-1].reshape(-1, 1)
         return replace(frame, points=np.where(seen > 0, _beams() * seen, np.nan).astype(np.float32))
 
     return spoil

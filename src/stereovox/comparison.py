@@ -20,7 +20,7 @@ from stereovox.se3 import Transform, apart, rotation_matrix
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 from stereovox.sensors.noise import RangeNoise
-from stereovox.trust.disagreement import EXPLAINED, FEW, Sight
+from stereovox.trust.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
 from stereovox.trust.gate import Gate, Passed
 from stereovox.trust.glance import Glance, Votes
 from stereovox.trust.history import Doubt
@@ -30,8 +30,6 @@ FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
 """Most points of a frame in doubt that a glance keeps, that are looked at in the map, and that faults are tried on."""
-KNOWN = 0.1
-"""Share of the points that must lie in what the map knows."""
 BLUR = 1.5
 """Tolerance from glance to glance, as a multiple of that towards the map: both are noisy."""
 GAIN = 0.1
@@ -123,7 +121,7 @@ class Comparison:
         placed = _placed(voxel_map, T, points, tolerance)
         against = placed.against
         known = int((placed.agrees | against).sum())
-        anchored = float(placed.agrees.sum()) / known if known >= max(FEW, KNOWN * len(points)) else None
+        anchored = float(placed.agrees.sum()) / known if known >= max(FEW, MOSTLY_KNOWN * len(points)) else None
         votes, frames = Votes(), 0
         if doubt is not None and doubt.glance is not None:
             votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames

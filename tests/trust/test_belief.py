@@ -217,10 +217,13 @@ def test_what_cannot_be_compared_passes_unless_frames_are_in_doubt():
     assert told(None, 0.03, None) == [""] * 3
 
 
-def test_a_frame_that_sees_little_of_the_known_ends_a_doubt_where_that_agrees():
+def test_a_frame_nearly_all_of_which_is_where_it_was_is_in_no_doubt():
+    told = Told(AGREES)
+    assert told(*[0.03] * 30, *[0.6] * 3) == [""] * 33
     told = Told(STILL)
     told(*[0.03] * 30, *[0.6] * 20)
-    assert told(None) == [CONTRADICTS]
+    told.sight = AGREES._replace(fault="mirrored")
+    assert told(None, 0.6) == [CONTRADICTS] * 2
     told.sight = AGREES
     assert told(None) == [""]
     assert told.history.doubts == {}

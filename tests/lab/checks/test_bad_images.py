@@ -9,6 +9,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.lab.checks.bad_images import Trial, bad_frames, displaced, metres, trial
+from stereovox.lab.checks.lasting import FAULTS, Bad
 from stereovox.se3 import look_at
 from stereovox.simulate.passer_by import PasserBy
 from stereovox.simulate.scene import box
@@ -86,6 +87,31 @@ def test_a_knocked_camera_is_not_believed_until_it_agrees_again():
     assert set(told[52:80]) == {"camera_moved"}
     assert told[84:] == [None] * 6
     assert mapper.map.history.settled == {}
+
+
+LASTING = ("depth x 0.8", "depth x 1.2", "depth x 2", "mirrored",
+           "plane at 1 m", "0.3 m too far", "of another place")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small():
+    return [
+        replace(frame, depth=metres(frame), depth_scale=1.0)
+        for frame in sv.open_source("sim:room?image_width=160", frames=":150")
+    ]
+
+
+@pytest.mark.parametrize("kind", LASTING)
+def test_a_fault_is_not_believed_however_long_it_lasts(small, kind):
+    mapper = sv.Mapper(voxel_size=0.1)
+    for frame in small[:60]:
+        assert mapper.add(frame).refused is None
+    cells = mapper.map.storage.blocks()[1].tobytes()
+    bad = Bad(small[60:], small[60:][::-1], np.random.default_rng(0))
+    refused = [mapper.add(FAULTS[kind](frame, i, bad)).refused for i, frame in enumerate(small[60:])]
+    assert None not in refused
+    assert refused[-1] in ("contradicts_map", "camera_moved")
+    assert cells == mapper.map.storage.blocks()[1].tobytes()
 
 
 class Changing(PasserBy):

@@ -217,9 +217,9 @@ def test_what_cannot_be_compared_passes_unless_frames_are_in_doubt():
     assert told(None, 0.03, None) == [""] * 3
 
 
-def test_a_frame_nearly_all_of_which_is_where_it_was_is_in_no_doubt():
+def test_a_frame_nearly_all_of_which_is_where_it_was_ends_a_doubt_that_has_lasted():
     told = Told(AGREES)
-    assert told(*[0.03] * 30, *[0.6] * 3) == [""] * 33
+    assert told(*[0.03] * 30, *[0.6] * 3, None)[30:] == [DISAGREES] * 3 + [""]  # each alone, and none after them
     told = Told(STILL)
     told(*[0.03] * 30, *[0.6] * 20)
     told.sight = AGREES._replace(fault="mirrored")

@@ -32,8 +32,8 @@ ANCHORED = 0.5
 """Share of what a frame sees of the known that must agree with the map: a change of the world is local."""
 EXPLAINED = 0.4
 """Share of what does not agree that a fault must explain to be the cause."""
-MOSTLY_KNOWN, AGREES = 0.5, 0.9
-"""Shares of a frame's points that must be known, and of these that must agree, for there to be no doubt after all."""
+MOSTLY_KNOWN, AGREES = 0.5, 0.95
+"""Shares of a frame's points that must be known, and of these that must agree, for a doubt that has lasted to end."""
 FEW = 20
 """Points that are too few to judge by."""
 TELLING = 0.2
@@ -58,9 +58,9 @@ class Sight(NamedTuple):
     """How a frame in doubt lies in the map, point by point.
 
     anchored: share of its points on what is known that agree with the map; None where less than MOSTLY_KNOWN of all
-    are. fault: the fault under which it would agree, "" where there is none. against: how many points contradict the map. behind: how
-    many of the points are known surfaces that are seen through what is known as occupied. votes: what the glance
-    before says of both. glance: what it sees itself.
+    are. fault: the fault under which it would agree, "" where there is none. against: how many points contradict the
+    map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
+    the glance before says of both. glance: what it sees itself.
     """
 
     anchored: float | None
@@ -72,7 +72,7 @@ class Sight(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether it agrees with the map after all: it sees much of the known, and nearly all of that is there."""
+        """Whether it ends a doubt that has lasted: it sees much of the known, and nearly all of that is there."""
         return (self.anchored or 0.0) >= AGREES and not self.fault
 
     @property
@@ -160,15 +160,16 @@ class DisagreementMonitor:
         before = self._history.doubts.get(sensor)
         if sight is None:
             return Agreement(against, before if against is None else None)
-        if sight.agrees:
-            return Agreement(1 - (sight.anchored or 0.0) if against is None else against)
         limit = self.limit(sensor, stamp_ns)
         doubt = Doubt(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
+        if sight.agrees and self._lasted(doubt, self._changed_ns):
+            return Agreement(1 - (sight.anchored or 0.0) if against is None else against)
         doubt = self._judged(doubt, sight)
         if doubt.verdict == CHANGED:
             waited = before is not None and before.verdict == CHANGED
             return Agreement(against, doubt, "" if waited or before is None else self._reason(before))
-        self._remember(sensor, doubt)
+        if before is not None or not sight.agrees:  # or else it alone is in doubt, and not those after it
+            self._remember(sensor, doubt)
         raise self._refusal(frame, against, limit, doubt, sight)
 
     def accept(self, sensor: str, agreement: Agreement) -> None:

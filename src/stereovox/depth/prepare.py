@@ -40,8 +40,8 @@ STEPS = np.array([1, 2, 4])
 FROM = np.array([1, 1, 3])
 """A pixel takes part in a pass where its noise is more than this many times FINE cells."""
 WIDTHS = np.array([9 / 7, 9 / 7, 8 / 7], np.float32)
-"""A neighbour counts less the more it differs, and not at all beyond this many times `sensor.fade` sigma; at `fade` itself
-its weight is below 0.03. So nothing is averaged in that the sensor model would clear."""
+"""A neighbour counts less the more it differs, and not at all beyond this many times `sensor.fade` sigma. At `fade`
+itself its weight is below 0.03. So nothing is averaged in that the sensor model would clear."""
 APART = 2.5
 """Pixels so many `noise.correlation_px` apart count as independent: their errors have a correlation of 0.2."""
 FARTHEST_APART = 4

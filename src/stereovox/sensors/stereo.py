@@ -22,8 +22,8 @@ class Stereo:
 
     Within `fade` sigma of the range noise before the measured point there is no evidence; from there towards the camera
     the evidence for free space grows as a Gaussian falls: a surface measured too far does not clear itself, and a pole
-    that the camera or `depth.denoise` cannot separate from the wall behind it is not cleared. Behind the point there is no evidence either, so
-    walls do not grow thick (the weakness of Valenti 2018, section 8.4).
+    that the camera or `depth.denoise` cannot separate from the wall behind it is not cleared. Behind the point there is
+    no evidence either, so walls do not grow thick (the weakness of Valenti 2018, section 8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
     its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which

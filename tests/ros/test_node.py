@@ -38,8 +38,8 @@ from stereovox.simulate.simulation import Simulation  # noqa: E402
 TFMessage = tf_message()
 Octomap = optional_message("octomap_msgs", "Octomap")
 MOUNT = f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708"
-STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}
-"""The images of the walk show no floor: its world stands on it."""
+STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6], "trust.stale_s": 600.0, "trust.lost_s": 900.0}
+"""The images of the walk show no floor: its world stands on it. On a busy machine, maps are published however late."""
 BY_TF = {"odometry": (), "fixed": ()} if TFMessage else {"odometry": ("/odom",), "fixed": (MOUNT,)}
 """tf2_msgs is not on PyPI: without it poses come by odometry."""
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

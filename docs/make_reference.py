@@ -92,8 +92,9 @@ OUTPUTS = """# Outputs
 
 What leaves a map: functions and classes of `stereovox` (`sv`), outputs of `stereovox live`, files by their ending, and
 ROS topics. For each property of the map, a cell says what the output does with it: it *uses* it, *refuses* if it is
-bad, *carries* it *along*, or the number of the note that says why it has no meaning there. [What a map promises](../safety.md) explains ages, health and what
-unknown means. In Python: `stereovox.products.context.OUTPUTS`.
+bad, *carries* it *along*, or the number of the note that says why it has no meaning there.
+[What a map promises](../safety.md) explains ages, health and what unknown means. In Python:
+`stereovox.products.context.OUTPUTS`.
 
 {table}
 """

@@ -101,7 +101,7 @@ def _depth(change: Callable[[Depth, np.random.Generator], Depth]) -> Fault:
 
     def spoil(frame: Any, i: int, bad: Bad) -> Any:
         if isinstance(frame, Frame):
-            seen = change(frame.depth, bad.random)
+            seen = change(np.asarray(frame.depth, np.float32), bad.random)
             return replace(frame, depth=np.ascontiguousarray(seen, np.float32), reason=None)
         ranges = np.linalg.norm(frame.points, axis=1).reshape(len(RINGS), len(TURN))[::-1].astype(np.float32)
         ranges[~np.isfinite(ranges)] = 0

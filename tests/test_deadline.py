@@ -155,16 +155,14 @@ def test_near_says_of_what_is_near_what_full_says_and_of_the_rest_nothing(integr
     frame = stage(*things)
     full, near, _ = quality_levels(load_config(voxel_size=0.1, integrator=integrator, **{"ray.update": "once"}))
     in_full, in_short = said(full, frame), said(near, frame)
-    marks = clears = unsure = 0
+    marks = clears = 0
     for block, values in in_short.items():
         whole = in_full.get(block, np.zeros(512, int))
-        assert not ((values < 0) & (whole > 0)).any()
-        unsure += ((values < 0) & (whole == 0)).sum()
+        assert not ((values < 0) & (whole >= 0)).any()
         assert not ((values > 0) & (whole <= 0)).any()
         marks, clears = marks + (values > 0).sum(), clears + (values < 0).sum()
     assert marks > 20
-    assert unsure < 0.002 * clears  # right before a thing just beyond the limit, which `near` does not see
-    assert 0.05 < clears / sum((values < 0).sum() for values in in_full.values()) < 0.7
+    assert 0.05 < clears / sum((values < 0).sum() for values in in_full.values()) < 0.5
 
 
 def test_coarse_keeps_a_thin_post_that_stands_near():

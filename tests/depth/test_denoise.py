@@ -9,8 +9,6 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.prepare import denoise
 from stereovox.frame import Frame, Reason
-from stereovox.sensors.noise import FADE
-from stereovox.sensors.stereo import Stereo
 from stereovox.simulate.d435 import smooth_noise
 
 CAMERA = PinholeCamera(64, 48, 415.0, 415.0, 31.5, 23.5, baseline=0.05)
@@ -183,17 +181,3 @@ def test_a_binned_camera_has_the_noise_of_its_sensor():
     depth = measured(np.full((48, 64), 4.0))
     binned = PinholeCamera(128, 96, 830.0, 830.0, 63.5, 47.5, baseline=0.025).binned(2)
     np.testing.assert_allclose(cleaned(depth, camera=binned), cleaned(depth), rtol=1e-6)
-
-
-def test_nothing_is_averaged_in_that_the_sensor_model_would_clear():
-    """One number sets both: at `fade` sigma a neighbour has hardly any weight left, and there clearing begins."""
-    for fade in (1.0, 2.0, FADE):
-        config = load_config(CONFIG, **{"sensor.fade": fade})
-        wall = np.full((48, 64), 1 / 4.0)
-        wall[:, 32] += fade * S2  # a rod, `fade` sigma before its wall
-        depth = (1 / wall).astype(np.float32)
-        moved = (1 / depth - 1 / cleaned(depth, config))[8:-8, 32]
-        assert np.abs(moved).max() < 0.05 * fade * S2
-        model, sigma = Stereo(fade=fade), S2 * 16.0
-        assert model.probability(4.0 - 0.99 * fade * sigma, 4.0, sigma) == 0.5
-        assert model.probability(4.0 - 1.2 * fade * sigma, 4.0, sigma) < 0.5

@@ -79,7 +79,8 @@ def test_wrong_use_ends_in_one_line(radius, margin, told):
 def test_a_floor_map_is_exported_inflated(tmp_path):
     voxel_map = VoxelMap.from_cells(load_config(voxel_size=0.1), [[0, 0, 5], [12, 9, 5]], [2.0, -3.0])
     voxel_map.save(tmp_path / "one.svox")
-    assert main(["export", str(tmp_path / "one.svox"), str(tmp_path / "one.yaml"), "--inflate", "0.25"]) == 0
+    low = ["--floor", "0", "--heights", "0.5:0.6"]
+    assert main(["export", str(tmp_path / "one.svox"), str(tmp_path / "one.yaml"), "--inflate", "0.25", *low]) == 0
     grid = read_map_server(tmp_path / "one.yaml")
     assert (grid.cells == 100).sum() == by_hand(np.eye(10, 13) * (np.arange(13) == 0) > 0, (0.1, 0.1), 0.25, 1).sum()
     assert main(["export", str(tmp_path / "one.svox"), str(tmp_path / "one.ply"), "--inflate", "0.25"]) == 2

@@ -19,7 +19,6 @@ from stereovox.depth import _images
 from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason, name_of
-from stereovox.sensors import fade_of
 from stereovox.sensors.noise import RangeNoise
 from stereovox.trust.validate import for_kernels, rigid_pose, validate_fields
 
@@ -39,9 +38,8 @@ STEPS = np.array([1, 2, 4])
 """Distance of the neighbours in pixels, pass by pass."""
 FROM = np.array([1, 1, 3])
 """A pixel takes part in a pass where its noise is more than this many times FINE cells."""
-WIDTHS = np.array([9 / 7, 9 / 7, 8 / 7], np.float32)
-"""A neighbour counts less the more it differs, and not at all beyond this many times `sensor.fade` sigma. At `fade`
-itself its weight is below 0.03. So nothing is averaged in that the sensor model would clear."""
+WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
+"""A neighbour counts less the more it differs, and not at all beyond this many sigma."""
 APART = 2.5
 """Pixels so many `noise.correlation_px` apart count as independent: their errors have a correlation of 0.2."""
 FARTHEST_APART = 4
@@ -117,9 +115,7 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     shows the wall behind, and a wire the other way round; in later passes the remaining noise no longer hides the step.
     Averaging rows first would remove a pole two sigma in front of its wall.
 
-    Limitation: a step of less than about two sigma is smoothed over some pixels. The sensor model clears nothing within
-    `sensor.fade` sigma before a depth, of which the widths k are multiples: a thing that is averaged into its wall is
-    not cleared by it.
+    Limitation: a step of less than about two sigma is smoothed over some pixels.
     """
     if not config.depth.denoise:
         return
@@ -234,8 +230,7 @@ def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: C
     rings = np.empty((len(STEPS) + 1, 2 * margin + 1, width + 2 * margin), np.float32)
     low, high, limit = np.float32(config.min_range), np.float32(config.max_range), np.float32(LIMIT * config.voxel_size)
     sigma, leaves = _numbers(noise, fine)
-    widths = np.float32(fade_of(config.sensor)) * WIDTHS
-    _images.denoise(depth_m, sigma, steps, leaves, widths, limit, low, high, rings)
+    _images.denoise(depth_m, sigma, steps, leaves, WIDTHS, limit, low, high, rings)
 
 
 def stretched(correlation_px: float) -> int:

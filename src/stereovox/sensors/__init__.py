@@ -10,7 +10,6 @@ from stereovox import registry
 from stereovox.config import SensorConfig
 from stereovox.errors import ConfigError, did_you_mean
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.sensors.noise import FADE
 
 SENSORS = {
     "stereo": "stereovox.sensors.stereo:Stereo",
@@ -31,11 +30,6 @@ def make_sensor(config: SensorConfig) -> InverseSensorModel:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ConfigError(f"sensor.{name} {value!r}: must be a number")
     return _checked(model(**parameters), config.model)
-
-
-def fade_of(config: SensorConfig) -> float:
-    """Return within how many sigma before a measured point the model clears nothing; of one without `fade` FADE."""
-    return float(config.parameters().get("fade", FADE))
 
 
 def _checked(model: Any, name: str) -> InverseSensorModel:

@@ -14,9 +14,6 @@ from stereovox.cameras.rigs import VirtualCamera
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import NoiseConfig
 
-FADE = 3.5
-"""Sigma before a measured point within which the default model clears nothing, and beyond which denoising averages
-nothing (depth/prepare.py): what may have been averaged into the wall behind it must not be cleared."""
 SUBPIXEL = 0.08
 """Default disparity noise in pixels: that of a RealSense D435 (Chien 2020, 2.2.4)."""
 

@@ -8,12 +8,7 @@ from math import erf, exp, pi, sqrt
 
 import numpy as np
 
-from stereovox.errors import ConfigError
-from stereovox.sensors.model import REACH_SIGMA, Array
-from stereovox.sensors.noise import FADE
-
-MAX_FADE = REACH_SIGMA - 0.25
-"""Beyond it hardly any evidence for free space would be left: the table of a model ends at REACH_SIGMA."""
+from stereovox.sensors.model import Array
 
 
 @dataclass(frozen=True)
@@ -21,9 +16,9 @@ class Stereo:
     """A model of stereo's range noise and of the size of cells.
 
     Within `fade` sigma of the range noise before the measured point there is no evidence; from there towards the camera
-    the evidence for free space grows as a Gaussian falls: a surface measured too far does not clear itself, and a pole
-    that the camera or `depth.denoise` cannot separate from the wall behind it is not cleared. Behind the point there is
-    no evidence either, so walls do not grow thick (the weakness of Valenti 2018, section 8.4).
+    the evidence for free space grows as a Gaussian falls: a surface measured too far does not clear itself, nor does
+    a pole that the camera cannot separate from the wall behind it. Behind the point there is no evidence either, so
+    walls do not grow thick (the weakness of Valenti 2018, section 8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
     its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which
@@ -39,17 +34,12 @@ class Stereo:
     p_free: float = 0.35
     p_unknown: float = 0.5
     p_least: float = 0.7
-    fade: float = FADE
+    fade: float = 2.0
     passes: float = 0.3
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.fade <= MAX_FADE:
-            raise ConfigError(f"sensor.fade {self.fade:g}: give 0 to {MAX_FADE:g} sigma")
 
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
         """Return p_free rising to p_unknown at `fade` sigma before the measurement."""
-        fall = (REACH_SIGMA - self.fade) / 2  # beyond the end of the table the evidence is what it is there
-        t = np.minimum((np.asarray(z) - z_measured) / sigma + self.fade, 0.0) / fall
+        t = np.minimum((np.asarray(z) - z_measured) / sigma + self.fade, 0.0)
         before = self.p_free + (self.p_unknown - self.p_free) * np.exp(-0.5 * t * t)
         return np.where(t < 0, before, self.p_unknown)
 

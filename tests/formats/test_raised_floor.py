@@ -32,7 +32,7 @@ def test_each_cell_becomes_a_column(tmp_path):
         np.testing.assert_array_equal(states, grid.states.ravel())
     for height in (-0.01, 0.31):
         assert not made.state(np.column_stack([places, np.full(len(places), height)])).any()
-    again = project(made, (0.0, 0.3))
+    again = project(made, (0.0, 0.3), floor=0.0)
     assert (again.states == State.OCCUPIED).sum() == (grid.states == State.OCCUPIED).sum()
     assert "41 x 30 cells" in made.history.imported.holds
     assert "columns from 0 to 0.3 m" in made.history.imported.notes[0]

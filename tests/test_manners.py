@@ -152,7 +152,7 @@ def test_refused_frames_name_the_shape(words, changed):
 @pytest.mark.parametrize(
     ("words", "changed"),
     [
-        ("ranges are (9, 2) float32", {"ranges": np.ones((9, 2), np.float32)}),
+        ("ranges are (9, 2)", {"ranges": np.ones((9, 2), np.float32)}),
         ("its shape is (3, 3)", {"T_world_sensor": EYE}),
         ("its shape is (3, 3)", {"T_base_sensor": EYE}),
         ("clear is (3,) float32", {"clear": np.ones(3, np.float32)}),

@@ -10,12 +10,20 @@ camera is, and a surface beside which much free space lies deeper (a table whose
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.products.ground_surfaces import BESIDE, LARGE, NO_SURFACE, TIE, Floor, nearest_surface, one_level
+from stereovox.products.ground_surfaces import (
+    BESIDE,
+    LARGE,
+    NO_SURFACE,
+    TIE,
+    Floor,
+    add_islands,
+    nearest_surface,
+    one_level,
+)
 from stereovox.products.neighbours import components
 
 ROOM = 1.8
@@ -79,7 +87,7 @@ class FloorSearch:
         allowed = np.where(large, self._step, np.where(self._stands(surfaces, group), -1, self._climb))
         for _ in range(ROUNDS):
             before = np.count_nonzero(levels == NO_SURFACE)
-            self._add_islands(levels, surfaces, group, allowed)
+            add_islands(levels, surfaces, group, allowed, self._here)
             if np.count_nonzero(levels == NO_SURFACE) == before:
                 break
         return levels
@@ -154,21 +162,6 @@ class FloorSearch:
         lowest = np.full(floor.shape, NO_SURFACE, np.int64)
         np.minimum.at(lowest, (y - floor.first[1], x - floor.first[0]), up if floor.sign > 0 else -1 - up)
         return lowest
-
-    def _add_islands(
-        self, levels: NDArray[np.int64], surfaces: NDArray[np.int64], group: NDArray[np.int32], allowed: NDArray[Any]
-    ) -> None:
-        """Add the groups of surfaces that begin no more than `allowed` cells higher or lower than the nearest floor."""
-        from scipy.ndimage import distance_transform_edt
-
-        away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
-        rows, columns, heights = surfaces.T
-        run, rise = away[rows, columns], np.abs(heights - levels[tuple(nearest[:, rows, columns])])
-        order = np.lexsort((rise, run))  # the nearest of each group comes first
-        _, firsts = np.unique(group[order], return_index=True)
-        joins = rise[order[firsts]] <= allowed
-        more = one_level(levels.shape, surfaces[joins[group]], self._here)
-        np.copyto(levels, more, where=levels == NO_SURFACE)
 
     def _leaks(self, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return where the floor (rows, columns) rises too fast above lower floor nearby."""

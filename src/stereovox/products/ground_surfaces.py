@@ -113,7 +113,7 @@ def ground_levels(
     here = None if start is None else place_of(floor, start)
     first = _lowest_large(surfaces, group) if here is None else group[nearest_surface(floor, surfaces, here)]
     levels = one_level(floor.shape, surfaces[group == first], here)
-    _add_islands(levels, surfaces, group, climb, here)
+    add_islands(levels, surfaces, group, climb, here)
     return np.ma.masked_equal(levels, NO_SURFACE), one_level(floor.shape, surfaces, None)
 
 
@@ -151,14 +151,17 @@ def one_level(
     return levels
 
 
-def _add_islands(
+def add_islands(
     levels: NDArray[np.int64],
     surfaces: NDArray[np.int64],
     group: NDArray[np.int32],
-    climb: int,
+    climb: int | NDArray[np.integer],
     here: NDArray[np.float64] | None,
 ) -> None:
-    """Add to `levels` the groups of surfaces that are no more than `climb` higher or lower than the nearest ground."""
+    """Add to `levels` the groups of surfaces that are no more than `climb` higher or lower than the nearest ground.
+
+    climb: in cells, for all groups or (groups,) for each.
+    """
     from scipy.ndimage import distance_transform_edt
 
     away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())

@@ -51,7 +51,7 @@ def warm_up(config: Config, tracked: bool = False, localised: bool = False, clou
         for frame in frames:
             mapper.add(frame)
         if clouds:
-            mapper.add(Cloud(middle * np.eye(2, 3), T_world_camera, 9))
+            mapper.add(Cloud(_wall(middle), T_world_camera, 9))
         with suppress(StereovoxError):  # a map that is not level has no 2-D map
             LiveProjection(mapper.map).grid()
         mapper.close()
@@ -64,6 +64,13 @@ def warm_up(config: Config, tracked: bool = False, localised: bool = False, clou
             tracker.add(replace(frame, stamp_ns=stamp_ns))
     if localised:
         _warm_up_localization(config)
+
+
+def _wall(metres: float) -> NDArray[np.float64]:
+    """Return points (N, 3) of a wall ahead, enough for all that clouds are checked for."""
+    across = np.linspace(-0.5, 0.5, 32) * metres
+    y, z = (axis.ravel() for axis in np.meshgrid(across, across))
+    return np.column_stack([np.full(y.size, metres), y, z])
 
 
 def _pattern(camera: PinholeCamera) -> NDArray[np.uint8]:

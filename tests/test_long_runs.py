@@ -48,10 +48,10 @@ def of_other_kinds(frame):
 
 
 def scans(frames):
-    ranges = np.linspace(1, 4, 90, dtype=np.float32)
-    fixed = ranges.copy()
-    fixed.flags.writeable = False
     for n, frame in enumerate(frames):
+        ranges = np.linspace(1, 4 + 0.001 * n, 90, dtype=np.float32)
+        fixed = ranges.copy()
+        fixed.flags.writeable = False
         pose = np.eye(4)
         pose[0, 3] = 0.5 * n
         given = {} if n < 2 else {"clear": fixed, "clear_from": np.zeros(90)}

@@ -145,10 +145,11 @@ def test_numbers_and_arrays_of_odd_kinds(mapper):
     assert len(cells)
     assert (cells == odd_cells).all()
     assert (values == odd_values).all()
-    for scale in (np.float16(0), np.float16(np.inf), np.float16(np.nan), np.float16(-1)):
+    for scale in (np.float16(0), np.float16(np.inf), np.float16(-1)):
         assert maps[0].add(replace(odd, depth_scale=scale, stamp_ns=1)).refused == "bad_scale"
+    assert maps[0].add(replace(odd, depth_scale=np.float16(np.nan), stamp_ns=1)).refused is None  # NaN: not given
     bad = np.matrix(np.full((12, 16), 9, np.uint8))
-    assert maps[0].add(replace(plain, reason=bad, stamp_ns=1)).refused == "bad_reason"
+    assert maps[0].add(replace(plain, reason=bad, stamp_ns=2)).refused == "bad_reason"
 
 
 def test_what_is_kept_for_cameras_is_bounded_by_their_pixels():

@@ -45,7 +45,8 @@ def frames_of(sensor, number):
 def scans_of(sensor, number):
     chance = np.random.default_rng(sensor)
     for k in range(number):
-        ranges = chance.uniform(0.5, 4, 90).astype(np.float32)
+        ranges = np.repeat(chance.uniform(0.5, 4, 9), 10).astype(np.float32)
+        ranges += chance.normal(0, 0.002, 90).astype(np.float32)
         pose = se2.lifted([0.05 * k, sensor, 0.1 * k])
         fault = "unreadable" if k % 7 == 5 else None
         yield sv.Scan(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that strangers call a grid: bombs, headers that lie, pickles."""
 
+import hashlib
 import io
 import json
 import tracemalloc
@@ -13,6 +14,7 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.safe_io import sealed
 
 
 @pytest.fixture
@@ -89,11 +91,13 @@ def test_a_part_twice(tmp_path, parts):
 @pytest.mark.parametrize("count", [-1, 1.5, 10**30, None, "1"])
 def test_counts_that_are_none(tmp_path, parts, count):
     about = json.loads(parts["about.npy"][128:])
-    text = json.dumps({**about, "frames": count}).encode()
+    about.pop("digest")
+    text = sealed({**about, "frames": count})
     assert "frames" in refusal(packed(tmp_path / "a.npz", {**parts, "about.npy": array((len(text),), "|u1", text)}))
 
 
 def test_settings_that_nest_deeply(tmp_path, parts):
-    text = b'{"a":' * 100_000
+    body = b'"a": ' + b'{"a":' * 100_000
+    text = b'{"digest": "%s", ' % hashlib.blake2b(body, digest_size=16).hexdigest().encode() + body
     said = refusal(packed(tmp_path / "a.npz", {**parts, "about.npy": array((len(text),), "|u1", text)}))
     assert "nested too deeply" in said

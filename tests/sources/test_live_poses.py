@@ -124,9 +124,12 @@ def test_nobody_waits_for_a_stream_that_has_ended():
 def test_threads_add_and_ask_at_once():
     """Two writers and three readers; every answer is the one truth, however the threads take turns."""
     poses, wrong = LivePoses(max_speed_mps=1e3, clock=lambda: 0.0), []  # all at once: no clock that was set back
+    together = threading.Barrier(2)
 
     def write(first):
         for k in range(first, 2000, 2):
+            if k % 100 == first:  # a writer that is 1 s behind would be one whose clock was set back
+                together.wait(60.0)
             poses.add(k * MS, pose(k * 0.001))
 
     def read(seed):

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from entrance_cases import good
 from stereovox.comparison import pose_on_surfaces
 from stereovox.config import load_config
 from stereovox.depth import DepthPipeline
 from stereovox.lab.checks.bad_images import displaced
 from stereovox.se3 import inverse
+
+NARROW = sv.PinholeCamera(64, 48, 400.0, 400.0, 31.5, 23.5, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +55,37 @@ def test_images_of_few_rows_are_looked_for_as_well(room, height):
     voxel_map, frame = room
     image = DepthPipeline(load_config()).image(sv.Frame(np.full((height, 640), 2.0), camera, frame.T_world_sensor))
     assert pose_on_surfaces(voxel_map, image) is None or height == 7
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("far_m", [1e9, 1e150])
+def test_points_beyond_the_map_do_not_count(far_m):
+    """A lidar may give any number, and so many that they have normals; a frame in doubt is compared with the map."""
+    lean = np.random.default_rng(1).uniform(-1, 1, (400, 2))
+    far = far_m * np.column_stack([np.ones(400), lean])
+    found = []
+    for more in (far[:0], far):
+        mapper = sv.Mapper(voxel_size=0.1, max_range=5.0)
+        clouds = [good("cloud", n) for n in range(5)]
+        clouds[3] = replace(clouds[3], points=0.7 * clouds[3].points)
+        reports = [mapper.add(replace(cloud, points=np.concatenate([cloud.points, more]))) for cloud in clouds]
+        found.append(([report.refused for report in reports], mapper.map.counts()["occupied"]))
+    assert found[0][0] == [None, None, None, "disagrees_with_map", None]
+    assert found[0] == found[1]
+
+
+def test_a_saved_map_holds_no_cells_that_cannot_be_read(tmp_path):
+    """Poses so far away that cell numbers come to an end are refused before, whatever the cells' sides."""
+    rng = np.random.default_rng(2)
+    for steps in ((0.002, 0.002, 0.0005), (0.004, 0.001, 0.001)):
+        mapper = sv.Mapper(steps=steps, max_range=1.0, **{"trust.max_speed_mps": 1e12, "trust.ordered": False})
+        limits = 2**30 * np.array(steps)
+        for n in range(6):
+            place = np.minimum(0.9e6, limits * rng.choice([0.9, 0.997, 0.999, 1.001], 3))
+            frame = good("depth image", n)
+            T = np.array(frame.T_world_sensor)
+            T[:3, 3] = place * rng.choice([-1, 1], 3)
+            report = mapper.add(replace(frame, camera=NARROW, T_world_sensor=T))
+            assert (report.refused == "pose_too_far") == bool((np.abs(place) > limits - 2**21 * np.array(steps)).any())
+        mapper.save(tmp_path / "map")
+        assert sv.load_map(tmp_path / "map").counts() == mapper.map.counts()

@@ -38,6 +38,8 @@ DEEP_CELLS = 4
 """Cells from a surface that is seen through to what is seen behind it; a floor seen at a flat angle is thick."""
 REACH = 60.0
 """Metres along a ray within which the map's first surface is sought."""
+FARTHEST = 10
+"""Maximum ranges beyond which points do not count: a lidar may give any number, and the map ends somewhere."""
 
 MIRRORED = {
     "mirrored": (-1, 1, 1),
@@ -115,7 +117,7 @@ class Comparison:
 
     def _sight(self, image: AnyImage, doubt: Doubt | None, voxel_map: VoxelMap) -> Sight:
         """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
-        T, seen = image.T_world_sensor, _sampled(image, GLANCED)
+        T, seen = image.T_world_sensor, _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range)
         points = _thinned(seen, POINTS)
         tolerance = np.maximum(voxel_map.voxel_size, self._noise[image.camera].sigma(np.linalg.norm(points, axis=1)))
         placed = _placed(voxel_map, T, points, tolerance)
@@ -217,7 +219,7 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the search
     radius shrinks from iteration to iteration.
     """
-    points, normals = _surfaces(image)
+    points, normals = _surfaces(image, FARTHEST * voxel_map.config.max_range)
     T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
     for reach in np.geomspace(REACH_M, last, STEPS):
         there, planes = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
@@ -232,14 +234,22 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     return T if elsewhere else None
 
 
-def _sampled(image: AnyImage, most: int) -> NDArray[np.float64]:
-    """Return some of the image's points (N, 3) in the sensor's frame, about `most` at most."""
+def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
+    """Return some of the image's points (N, 3) up to `reach` metres from the sensor, in its frame, about `most`."""
     if isinstance(image, CheckedCloud):
-        return _thinned(image.ends[image.hits], most)
+        points = image.ends[image.hits]
+        return _thinned(points[_near(points, reach)], most)
     step = max(1, round((image.depth_m.size / most) ** 0.5))
     rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
     points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-    return points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+    return points[_near(points, reach)]
+
+
+def _near(points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """Return which points (..., 3) are finite, lie up to `reach` metres from the sensor, and not in it."""
+    with np.errstate(over="ignore"):
+        away = np.linalg.norm(points, axis=-1)
+    return (away > 0) & (away <= reach)
 
 
 def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
@@ -247,10 +257,11 @@ def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return values[:: max(1, -(-len(values) // most))]
 
 
-def _surfaces(image: AnyImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the sensor's frame."""
+def _surfaces(image: AnyImage, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some points (N, 3) up to `reach` metres from the sensor, and their normals (N, 3), in its frame."""
     if isinstance(image, CheckedCloud):
-        return _surfaces_of_cloud(image.ends[image.hits])
+        points = image.ends[image.hits]
+        return _surfaces_of_cloud(points[_near(points, reach)])
     height, width = image.depth_m.shape
     step = max(1, round((image.depth_m.size / ALIGNED) ** 0.5))
     rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
@@ -260,7 +271,7 @@ def _surfaces(image: AnyImage) -> tuple[NDArray[np.float64], NDArray[np.float64]
     down = _points(image, v + BESIDE, u) - _points(image, v - BESIDE, u)
     normals = np.cross(across, down)
     length = np.linalg.norm(normals, axis=-1)
-    seen = np.isfinite(here).all(axis=-1) & np.isfinite(length) & (length > 0)
+    seen = _near(here, reach) & np.isfinite(length) & (length > 0)
     return here[seen], normals[seen] / length[seen][:, None]
 
 

@@ -9,6 +9,7 @@ from stereovox import registry
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyImage, DepthImage
+from stereovox.integrate.views import check_place
 from stereovox.maps.evidence import Evidence
 
 if TYPE_CHECKING:
@@ -49,7 +50,11 @@ class Integration:
         self._clouds: Points | None = None
 
     def evidence(self, image: AnyImage) -> Evidence:
-        """Return as `Integrator.evidence` and `Points.evidence`; FrameRefused `no_clouds` on graphics cards."""
+        """Return as `Integrator.evidence` and `Points.evidence`.
+
+        Raises FrameRefused `pose_too_far` for cells that no map can have, and `no_clouds` on graphics cards.
+        """
+        check_place(image.T_world_sensor, self._config)
         if isinstance(image, DepthImage):
             return self._images.evidence(image)
         if self._config.device != "cpu":

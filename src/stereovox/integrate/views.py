@@ -19,6 +19,7 @@ from stereovox.frame import DepthImage
 from stereovox.integrate import _cells
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.evidence import to_units
+from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.se3 import Transform
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
@@ -177,6 +178,14 @@ def _behind(clear: NDArray[np.int32], reach: NDArray[np.float64]) -> np.float32:
 def origin_block(T_world_camera: Transform, config: Config) -> NDArray[np.int64]:
     """Return the block (3,) the camera stands in; kernels count blocks and metres from there to keep float32 exact."""
     return np.floor(T_world_camera[:3, 3] / np.multiply(SIDE, config.cell)).astype(np.int64)
+
+
+def check_place(T_world_sensor: Transform, config: Config) -> None:
+    """Raise FrameRefused `pose_too_far` where a sensor that stands there sees cells that no map can have."""
+    limit = INDEX_LIMIT - (2 << _cells.WIDE)
+    if not (np.abs(T_world_sensor[:3, 3]) < limit * np.array(config.cell)).all():
+        detail = f"the pose is more than {limit} cells from the map's origin; subtract an offset, or use larger cells"
+        raise FrameRefused("pose_too_far", detail)
 
 
 def rays_of(image: DepthImage, config: Config) -> Rays:

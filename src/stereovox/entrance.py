@@ -178,7 +178,7 @@ ELSEWHERE = {
     "bad_pose_file": "a pose that cannot be read",
     "low_confidence": "camera pair: the tracker trusts its pose less than `min_confidence`",
     "not_localised": "the ROS 2 node does not know where the robot is in its map",
-    "clock_doubt": "live: it is not known how far the clocks of images and poses are apart",
+    "clock_doubt": "live, ROS 2: it is not known how far the clocks of sensors and poses are apart",
     "no_camera": "ROS 2: no camera info has come",
     "tracking_lost": "tracking: it is not known where the camera is",
     "no_photo": "tracking: no picture was taken along with a depth image",

@@ -200,7 +200,9 @@ class CameraClock:
             self._learn(frame, doubt, now_ns)
         if doubt.cleared or (doubt.became not in (LATE, CLOCK) and self._rests(frame.stamp_ns, doubt)):
             return
-        raise FrameRefused(REASON, f"{name_of(frame)}: {_words(doubt)}, and which is not known; {self._cure(doubt)}")
+        raise FrameRefused(
+            REASON, f"{name_of(frame)}: {doubt_words(doubt)}, and which is not known; {self._cure(doubt)}"
+        )
 
     def close(self) -> None:
         """End what runs in the background."""
@@ -217,11 +219,11 @@ class CameraClock:
             self._doubt, self._motion, self._failed, self._told_ns = doubt, None, "", now_ns
         if not doubt.told and (doubt.announced or now_ns - doubt.since_ns > TELL_NS):
             doubt.told, self._told_ns = True, now_ns
-            self._notify(f"{self._name}: {_words(doubt)}; images are left out while it moves; {self._cure(doubt)}")
+            self._notify(f"{self._name}: {doubt_words(doubt)}; images are left out while it moves; {self._cure(doubt)}")
         elif doubt.told and now_ns - self._told_ns > REMIND_NS:
             self._told_ns = now_ns
             why = self._failed or "its motion does not show it"
-            self._notify(f"{self._name}: {_words(doubt)}, and {why}; {self._cure(doubt)}")
+            self._notify(f"{self._name}: {doubt_words(doubt)}, and {why}; {self._cure(doubt)}")
         if isinstance(frame, Cloud | Scan):
             self._failed = "clouds and scans do not show it"
             return
@@ -290,7 +292,7 @@ def _range(doubt: ClockDoubt) -> Limits:
     return Limits(min(doubt.off_ns, 0) - AFTER_NS, max(doubt.off_ns, 0) + AFTER_NS)
 
 
-def _words(doubt: ClockDoubt) -> str:
+def doubt_words(doubt: ClockDoubt) -> str:
     """Say what is doubted."""
     seconds, later = abs(doubt.off_ns) / 1e9, doubt.off_ns > 0
     if doubt.start:

@@ -60,6 +60,14 @@ class Input(Protocol):
         """Convert a message; the `fault` of the result says why it cannot be used. None: it is not to be mapped."""
         ...
 
+    def refused(self, data: bytes, why: FrameRefused) -> Frame | Cloud | Scan | None:
+        """Convert a message whose stamp is doubted, which nothing is to use; `why` is its fault."""
+
+        def nowhere(frame_id: str, stamp_ns: int) -> Pose:
+            raise why
+
+        return self.frame(data, nowhere)
+
 
 def header(data: bytes) -> tuple[int, str]:
     """Read time in nanoseconds and frame from the header at the start of a message; raises ValueError."""

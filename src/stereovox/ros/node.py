@@ -11,11 +11,12 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from time import monotonic_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 from stereovox.errors import StereovoxError
 from stereovox.frame import Cloud, Frame, UpdateReport
 from stereovox.rebuild import CorrectionReport
+from stereovox.ros.clocks import NOTHING, Heard, SensorClocks
 from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
 from stereovox.ros.inputs import header
 from stereovox.ros.mapping import Mapping
@@ -28,6 +29,7 @@ from stereovox.ros.score import score_of
 from stereovox.ros.services import Services
 from stereovox.ros.stamps import StampsByNode
 from stereovox.ros.subscriptions import Silence, Subscriptions
+from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses
 from stereovox.se3 import inverse
 from stereovox.sources.waiting import Arrival, Waiting
 
@@ -35,6 +37,13 @@ IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when idle, and while frames are waiting."""
 MAX_AT_ONCE = 256
 """Messages that are received before the next frame is mapped."""
+
+
+class Message(NamedTuple):
+    """A message to map, as bytes, and what its stamp was found to be when it arrived."""
+
+    data: bytes
+    heard: Heard
 
 
 class MapNode:
@@ -71,8 +80,10 @@ class MapNode:
             self._poses.tf.add(parent, child, 0, numbers, fixed=True)
         self._inputs = {one.topic: one for one in self._source.inputs(options, mapping.config.dimensions)}
         wait_ns, late_ns = round(1e9 * options.wait_s), round(1e9 * options.late_s)
-        self.waiting: Waiting[bytes] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
+        self.waiting: Waiting[Message] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
         self.received: Counter[str] = Counter()
+        self._poses.tf.simulated = bool(node.get_parameter("use_sim_time").value)
+        self._clocks = SensorClocks(options.apart_s, lambda line: node.get_logger().warning(line))
         self._outputs = Outputs(node, mapping, options, self.counts)
         self._obstacles = Obstacles(node, mapping, options)
         Services(node, mapping, out, self._renewed, self._source.continuable)
@@ -88,6 +99,7 @@ class MapNode:
         history = self._mapping.history
         return {
             "received": self.received.total(),
+            "clock_doubt": self._clocks.refused.total(),
             "dropped": self.waiting.dropped.total(),
             "waiting": len(self.waiting),
             "frames_in_map": history.frames,
@@ -145,17 +157,28 @@ class MapNode:
         try:
             stamp_ns, frame_id = header(data)
             self._stamps.heard(stamp_ns)
+            heard = self._heard(topic, frame_id, stamp_ns)
         except ValueError:  # no pose to wait for: it is refused in its turn
-            stamp_ns, frame_id = 0, ""
-        self.waiting.put(topic, stamp_ns, frame_id, data)
+            stamp_ns, frame_id, heard = 0, "", NOTHING
+        self.waiting.put(topic, stamp_ns, frame_id, Message(data, heard))
 
-    def _ready(self, one: Arrival[bytes]) -> bool:
+    def _heard(self, topic: str, frame_id: str, stamp_ns: int) -> Heard:
+        arrived_ns = self._subscriptions.arrived_ns
+        if isinstance(self._poses, TrackedPoses) and isinstance(self._inputs[topic], TrackedDepthInput):
+            self._poses.images.heard(stamp_ns, arrived_ns)
+            return NOTHING
+        return self._clocks[topic].heard(stamp_ns, arrived_ns, self._poses.pace(frame_id))
+
+    def _ready(self, one: Arrival[Message]) -> bool:
         sensor = self._inputs[one.sensor]
+        if self._clocks[one.sensor].is_open(one.content.heard):
+            return False
         return sensor.ready and sensor.is_final(self._poses, one.frame_id, one.stamp_ns)
 
-    def _map(self, one: Arrival[bytes]) -> None:
-        sensor = self._inputs[one.sensor]
-        frame = sensor.frame(one.content, self._poses.pose)
+    def _map(self, one: Arrival[Message]) -> None:
+        sensor, (data, heard) = self._inputs[one.sensor], one.content
+        doubt = self._clocks.refusal(one.sensor, heard, one.stamp_ns) if sensor.ready else None
+        frame = sensor.frame(data, self._poses.pose) if doubt is None else sensor.refused(data, doubt)
         if frame is None:  # it told where the robot is, and is not to be mapped
             return
         report = self._mapping.add(frame)
@@ -184,6 +207,7 @@ class MapNode:
 
     def _renewed(self) -> None:
         self.waiting.clear()
+        self._clocks.forget()
         if self._corrector is not None:
             self._corrector.forget()
         self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")

@@ -49,6 +49,7 @@ class Options:
     world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected to the sensors first.
     base_frame: frame of the robot, on the floor, for floor maps; "": `base_footprint`, else `base_link`.
     wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may then be extrapolated.
+    apart_s: seconds by which frames and poses of the same time may arrive apart at the start; more: clocks differ.
     late_s: a frame that has waited this long for a busy map gives way to newer ones. queue: frames that wait per topic.
     map_rate, cloud_rate, obstacle_rate: largest rate in messages a second: of the 2-D map, of the cloud and the
     OctoMap, and of obstacles and free rays. obstacle_range: metres round the robot in which those are; blind_m: metres
@@ -80,6 +81,7 @@ class Options:
     base_frame: str = ""
     wait_s: float = 0.5
     extrapolate_s: float = 0.1
+    apart_s: float = 0.3
     late_s: float = 0.1
     queue: int = 10
     map_rate: float = 30.0
@@ -107,7 +109,7 @@ class Options:
         parse_start(self.start, f"{PREFIX}start")
         for text in self.exclude:
             region_of(text)
-        for name in ("wait_s", "extrapolate_s", "late_s", "tf_tolerance_s"):
+        for name in ("wait_s", "extrapolate_s", "apart_s", "late_s", "tf_tolerance_s"):
             if not 0 <= getattr(self, name) <= 60:
                 raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give seconds, 0 to 60")
         for name in ("map_rate", "cloud_rate", "obstacle_rate"):

@@ -3,43 +3,100 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import ClassVar, NamedTuple
+from array import array
+from collections.abc import Callable, Iterable
+from time import monotonic_ns
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.ros.clocks import Pace
 from stereovox.se3 import Transform
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import StampedTransform, frame_name, read_odometry, read_transforms
 from stereovox.sources.bags.tf import Edge, Limits, Tf, tf_poses
+from stereovox.sources.live_poses import REORDERED_NS, RESET_NS, SET_BACK
 from stereovox.sources.robots.frames import BASES
 
 MAX_TRANSFORMS = 2000
 """Transforms kept per frame; the older half is dropped when there are more."""
-RESET_NS = 1_000_000_000
-"""A transform this much older than the newest one means that the clock was set back: all before it are dropped."""
+
+
+class _Late(NamedTuple):
+    """A transform that is older than one before it, and when it came."""
+
+    stamp_ns: int
+    numbers: tuple[float, ...]
+    arrived_ns: int
 
 
 class LiveEdge(Edge):
-    """Recent poses of a frame in its parent.
+    """Recent poses of a frame in its parent. arrived: returns when the transform that is added arrived, monotonic.
+    simulated: as for `Pace`.
 
     A frame that has not moved may still move: unlike in a recording, it is never treated as fixed.
+
+    A clock that is set back by little shows as in `LivePoses`: transforms older than the newest one go on as time
+    passes. Then those before from their times on are dropped; two clocks are never mixed.
+
+    Attributes:
+        pace: How its transforms arrive.
     """
+
+    def __init__(self, parent: str, child: str, arrived: Callable[[], int] = monotonic_ns, simulated: bool = False):
+        super().__init__(parent, child)
+        self.pace, self._arrived = Pace(simulated), arrived
+        self._newest_ns: int | None = None
+        self._late: list[_Late] = []
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
         """Add tx ty tz qx qy qz qw at a time."""
-        if self._stamps and stamp_ns < max(self._stamps[-MAX_TRANSFORMS // 8 :]) - RESET_NS:
-            self._keep(0)
-        elif len(self._stamps) >= MAX_TRANSFORMS:
-            self._keep(MAX_TRANSFORMS // 2)
-        super().add(stamp_ns, numbers)
+        one = _Late(int(stamp_ns), tuple(numbers), self._arrived())
+        self.pace.heard(one.stamp_ns, one.arrived_ns)
+        if self._newest_ns is not None and one.stamp_ns < self._newest_ns - RESET_NS:
+            self.clear()
+        if self._newest_ns is None or one.stamp_ns > self._newest_ns:
+            self._put_late()
+            self._put(one)
+        elif one.stamp_ns < self._newest_ns:
+            self._take_late(one, self._newest_ns)
 
     def clear(self) -> None:
         """Drop all poses so far."""
         self._keep(0)
-        self._sorted = None
+        self._late, self._newest_ns, self._sorted = [], None, None
+
+    def _take_late(self, one: _Late, newest_ns: int) -> None:
+        if self._late and one.stamp_ns <= self._late[-1].stamp_ns:
+            self._put_late()
+        self._late.append(one)
+        if newest_ns - one.stamp_ns <= REORDERED_NS:
+            self._put(one)
+        if len(self._late) >= SET_BACK:
+            first = self._late[0]
+            if 2 * (one.arrived_ns - first.arrived_ns) > one.stamp_ns - first.stamp_ns:
+                self._drop_from(first.stamp_ns)
+            self._put_late()
+
+    def _put_late(self) -> None:
+        late, self._late = self._late, []
+        for one in late:  # of two with one time the first counts
+            self._put(one)
+
+    def _put(self, one: _Late) -> None:
+        if len(self._stamps) >= MAX_TRANSFORMS:
+            self._keep(MAX_TRANSFORMS // 2)
+        super().add(one.stamp_ns, one.numbers)
+        self._newest_ns = one.stamp_ns if self._newest_ns is None else max(self._newest_ns, one.stamp_ns)
+
+    def _drop_from(self, stamp_ns: int) -> None:
+        left = [k for k, stamp in enumerate(self._stamps) if stamp < stamp_ns]
+        rows = self._rows
+        self._rows = array("d", [number for k in left for number in rows[7 * k : 7 * k + 7]])
+        self._stamps = array("q", [self._stamps[k] for k in left])
+        self._newest_ns = max(self._stamps, default=None)
 
     def _keep(self, newest: int) -> None:
         del self._stamps[: len(self._stamps) - newest]
@@ -52,15 +109,35 @@ class LiveEdge(Edge):
 
 
 class LiveTf(Tf):
-    """Transforms between the frames of a running robot."""
+    """Transforms between the frames of a running robot.
 
-    edge: ClassVar[type[Edge]] = LiveEdge
+    Attributes:
+        arrived_ns: When the message that is read arrived, monotonic; None: now.
+        simulated: As for `Pace`; counts for frames that come later.
+    """
+
+    arrived_ns: int | None = None
+    simulated = False
 
     def forget(self, parent: str, child: str) -> None:
         """Drop all poses of a frame in its parent so far."""
         edge = self._edge(parent, child)
         assert isinstance(edge, LiveEdge)
         edge.clear()
+
+    def pace(self, target: str, source: str) -> Pace | None:
+        """Return how transforms arrive of what moves next to `source`; None where nothing moves or connects them."""
+        try:
+            up, down = self._path(frame_name(target), frame_name(source))
+        except FrameRefused:
+            return None
+        return next((one.pace for one in (*down, *up) if isinstance(one, LiveEdge) and not one.fixed), None)
+
+    def _new_edge(self, parent: str, child: str) -> Edge:
+        def arrived() -> int:
+            return monotonic_ns() if self.arrived_ns is None else self.arrived_ns
+
+        return LiveEdge(parent, child, arrived, self.simulated)
 
 
 class Pose(NamedTuple):
@@ -125,6 +202,13 @@ class PoseBuffer:
         T_world_sensor = self.tf.lookup(world, frame_id, stamp_ns)
         self.world, self._base = world, base
         return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
+
+    def pace(self, frame_id: str) -> Pace | None:
+        """Return how the poses of a frame in the world arrive; None where it is not known."""
+        try:
+            return self.tf.pace(self._world_of(frame_id), frame_id)
+        except FrameRefused:
+            return None
 
     def _add(self, one: StampedTransform, fixed: bool = False) -> None:
         self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from time import monotonic
+from time import monotonic, monotonic_ns, time_ns
 from typing import Any
 
 from stereovox.errors import StereovoxError, one_line
@@ -23,6 +23,8 @@ FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""
 TF2_MSGS = "Source a ROS 2 distribution (source /opt/ros/jazzy/setup.bash) or build it (docs/ros2.md)"
 """Where `tf2_msgs` comes from: it is not on PyPI."""
+LONGEST_NS = 10_000_000_000
+"""A message that lay in the middleware for longer has no time of reception that can be used."""
 POSE_QUEUE = 100
 """Length of the middleware's queues for pose messages."""
 
@@ -68,7 +70,7 @@ class Subscriptions:
     """Subscribes to all topics in the options, and to /tf and /tf_static.
 
     arrived: called with topic and bytes of a message to map. on_path: called with those of a corrected path.
-    messages: number of messages received, of all kinds.
+    messages: number of messages received, of all kinds. arrived_ns: when the last one arrived, monotonic.
     Raises StereovoxError, one line, for an invalid topic name, and where nothing can give a pose: no /tf, for want of
     `tf2_msgs`, and no other source of poses in the options.
     """
@@ -82,7 +84,7 @@ class Subscriptions:
         arrived: Callable[[str, bytes], None],
         on_path: Callable[[bytes], None] | None = None,
     ):
-        self._node, self.messages = node, 0
+        self._node, self._where, self.messages, self.arrived_ns = node, where, 0, 0
         images = _qos(options.queue, options.reliable)
         for topic, one in inputs.items():
             self._listen(one.kind, topic, partial(arrived, topic), images)
@@ -117,8 +119,9 @@ class Subscriptions:
         self._subscribe(getattr(import_module(f"{package}.msg"), name), topic, callback, qos)
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[bytes], None], qos: Any) -> None:
-        def receive(data: bytes) -> None:
+        def receive(data: bytes, info: Mapping[str, int]) -> None:
             self.messages += 1
+            self._where.tf.arrived_ns = self.arrived_ns = arrived(info)
             callback(data)
 
         from rclpy.exceptions import InvalidTopicNameException
@@ -127,6 +130,12 @@ class Subscriptions:
             self._node.create_subscription(kind, topic, receive, qos, raw=True)
         except InvalidTopicNameException as error:
             raise StereovoxError(f"topic '{topic}': {one_line(str(error).splitlines()[0].rstrip(':'))}") from None
+
+
+def arrived(info: Mapping[str, int]) -> int:
+    """Return when a message was received, monotonic nanoseconds, by what rclpy says of it; now where it does not."""
+    waited_ns = time_ns() - info.get("received_timestamp", 0)
+    return monotonic_ns() - (waited_ns if 0 <= waited_ns <= LONGEST_NS else 0)
 
 
 def _qos(depth: int, reliable: bool, latched: bool = False) -> Any:

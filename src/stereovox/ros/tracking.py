@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import Frame
+from stereovox.ros.clocks import Pace
 from stereovox.ros.inputs import DepthInput, PoseLookup
 from stereovox.ros.poses import LiveEdge, Pose, PoseBuffer
 from stereovox.se3 import Transform, inverse
@@ -55,13 +56,14 @@ class TrackedPoses(PoseBuffer):
         body: The frame whose poses are tracked; "" until the first frame decides it.
         on_robot: Whether that is a robot's frame, which is level at the start.
         rival: Another node's parent of that frame; "" without.
+        images: How those of the camera arrive, by whose stamps poses are.
     """
 
     def __init__(self, world: str, base: str, extrapolate_s: float, base_needed: bool = False):
         super().__init__(world or WORLD, base, extrapolate_s)
         self.body = self.rival = ""
         self.on_robot = False
-        self._base_needed = base_needed
+        self._base_needed, self.images = base_needed, Pace()
         self._way = LiveEdge(self.world, "")
         self._own: deque[int] = deque(maxlen=ECHOES)
 
@@ -108,6 +110,10 @@ class TrackedPoses(PoseBuffer):
         T_body_sensor = self.mount(frame_id, stamp_ns)
         T_world_sensor = self._way.at(stamp_ns, self.tf.limits, "tracked") @ T_body_sensor
         return Pose(T_world_sensor, T_body_sensor, self._way.off_ns(stamp_ns))
+
+    def pace(self, frame_id: str) -> Pace | None:
+        """Return how the images arrive that poses come from."""
+        return self.images
 
     def _add(self, one: StampedTransform, fixed: bool = False) -> None:
         own = one.parent == self.world and one.stamp_ns in self._own

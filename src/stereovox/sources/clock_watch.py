@@ -90,14 +90,15 @@ class ClockDoubt:
 class ClockWatch:
     """Compares the stamps of a sensor with those of the poses, as both arrive.
 
-    poses: delays of the poses, which whoever receives them takes in. Any thread may ask; one calls `heard`.
+    poses: delays of the poses, which whoever receives them takes in. start_ns: as START_NS. Any thread may ask; one calls
+    `heard`.
 
     Attributes:
         doubt: The doubt that is open; None: the clocks agree, or no poses come to compare with.
     """
 
-    def __init__(self, poses: Delays):
-        self._poses, self._delays = poses, Delays()
+    def __init__(self, poses: Delays, start_ns: int = START_NS):
+        self._poses, self._delays, self._start_ns = poses, Delays(), start_ns
         self._newest_ns: int | None = None
         self._usual_ns: int | None = None
         self._begun_ns = 0
@@ -150,7 +151,7 @@ class ClockWatch:
 
     def _is_usual(self, late_ns: int, announced: bool) -> bool:
         if self._usual_ns is None:
-            return abs(late_ns) <= START_NS
+            return abs(late_ns) <= self._start_ns
         return abs(late_ns - self._usual_ns) <= (ANNOUNCED_NS if announced else USUAL_NS)
 
     def _end(self, became: str) -> None:

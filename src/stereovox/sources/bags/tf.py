@@ -10,7 +10,6 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,9 +139,6 @@ class Tf:
     `notes` say so. Invalid transforms (see `is_motion`), and those of a frame to itself, are skipped, as in tf2.
     """
 
-    edge: ClassVar[type[Edge]] = Edge
-    """What a frame's places in its parent are kept in."""
-
     def __init__(self, where: str = "tf", limits: Limits | None = None):
         self.where, self.limits, self.unreadable = where, limits or Limits(), 0
         self._parents: dict[str, dict[str, Edge]] = {}
@@ -227,8 +223,11 @@ class Tf:
         parent, child = frame_name(parent), frame_name(child)
         edges = self._parents.setdefault(child, {})
         if parent not in edges:
-            edges[parent] = self.edge(parent, child)
+            edges[parent] = self._new_edge(parent, child)
         return edges[parent]
+
+    def _new_edge(self, parent: str, child: str) -> Edge:
+        return Edge(parent, child)
 
     def _up(self, frame: str) -> Edge | None:
         """Return the edge from a frame to its parent, None at a root."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from time import monotonic, monotonic_ns, time_ns
+from time import monotonic, monotonic_ns
 from typing import Any
 
 from stereovox.errors import StereovoxError, one_line
@@ -18,6 +18,7 @@ from stereovox.ros.inputs import DepthInput, Input
 from stereovox.ros.options import Options, split_pair
 from stereovox.ros.poses import PoseBuffer
 from stereovox.ros.tf_message import tf_message
+from stereovox.trust.wall_clock import epoch_ns
 
 FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""
@@ -134,7 +135,7 @@ class Subscriptions:
 
 def arrived(info: Mapping[str, int]) -> int:
     """Return when a message was received, monotonic nanoseconds, by what rclpy says of it; now where it does not."""
-    waited_ns = time_ns() - info.get("received_timestamp", 0)
+    waited_ns = epoch_ns() - info.get("received_timestamp", 0)
     return monotonic_ns() - (waited_ns if 0 <= waited_ns <= LONGEST_NS else 0)
 
 

@@ -90,8 +90,8 @@ class ClockDoubt:
 class ClockWatch:
     """Compares the stamps of a sensor with those of the poses, as both arrive.
 
-    poses: delays of the poses, which whoever receives them takes in. start_ns: as START_NS. Any thread may ask; one calls
-    `heard`.
+    poses: delays of the poses, which whoever receives them takes in. start_ns: as START_NS.
+    Any thread may ask; one calls `heard`.
 
     Attributes:
         doubt: The doubt that is open; None: the clocks agree, or no poses come to compare with.

@@ -45,6 +45,7 @@ class Drive:
                     extra_s = (late(t / S) if kind == "image" else 0.002) + self.random.exponential(0.003)
                     last[kind] = max(last[kind], wall_s + extra_s)  # messages of a topic do not overtake each other
                     events.append((round(last[kind] * S) + 5000 * S, kind, t))
+        now_ns = 0
         for now_ns, kind, t in sorted(events):
             off_ns = round((step if kind == "image" else pose_step)(t / S) * S)
             self._hear(kind, START + t + off_ns, t, now_ns)

@@ -37,8 +37,8 @@ class Flight:
         poses = LivePoses(clock=lambda: self.now)
         config = load_config("default", voxel_size=0.1)
         self.clock = CameraClock(
-            "left", poses, poses.delays, T_BODY_OPTICAL, config, self.told.append, "--clock-offset", start_s,
-            background=False,
+            "left", poses, poses.delays, T_BODY_OPTICAL, config, self.told.append,
+            lambda doubt, ahead_s: f"--clock-offset {start_s + ahead_s:.3f}", background=False,
         )  # fmt: skip
         random, waiting, pose_ns = np.random.default_rng(0), [], frames[0].stamp_ns
         for k, frame in enumerate(frames):
@@ -53,7 +53,7 @@ class Flight:
             off_ns = round(1e9 * (start_s + (step_s if k >= AT else 0)))
             stamp_ns = frame.stamp_ns + off_ns + self.clock.shift_ns
             waiting.append((replace(frame, stamp_ns=stamp_ns), self.clock.heard(stamp_ns, arrived_ns), arrived_ns))
-            while waiting and (waiting[0][1] is None or waiting[0][1].became or arrived_ns - waiting[0][2] > 300 * MS):
+            while waiting and (not waiting[0][1].is_open or arrived_ns - waiting[0][2] > 300 * MS):
                 self._map(poses, arrived_ns, *waiting.pop(0)[:2])
 
     def _map(self, poses, now_ns, frame, doubt):

@@ -146,10 +146,10 @@ def test_scans_enter_the_map_only_where_that_is_wanted(config):
     add_odometry(one.poses, floor().odometry.stamps_ns.tolist(), child="laser")
     scan = floor().scans[3]
     data = wire.packed(wire.messages().scan(scan, "laser"))
-    assert LocalizingScanInput("/scan", one, mapped=False).frame(data, one.poses.pose) is None
+    assert LocalizingScanInput("/scan", one, mapped=False).frame(data, one.poses.odometry) is None
     one, told = localizer(config)
     add_odometry(one.poses, floor().odometry.stamps_ns.tolist(), child="laser")
-    frame = LocalizingScanInput("/scan", one, mapped=True).frame(data, one.poses.pose)
+    frame = LocalizingScanInput("/scan", one, mapped=True).frame(data, one.poses.odometry)
     if told[0].settled:
         expected = se2.lifted(told[0].pose_map_odom) @ floor().odometry.at(scan.stamp_ns)
         np.testing.assert_allclose(frame.T_world_sensor, expected, atol=1e-6)

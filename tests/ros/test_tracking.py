@@ -41,7 +41,7 @@ def tracked(room: list[Frame], poses: TrackedPoses, config) -> tuple[list[Frame]
     frames = []
     for frame in room:
         camera.on_camera_info(wire.packed(wire.messages().camera_info(frame.camera, frame.stamp_ns, OPTICAL)))
-        frames.append(camera.frame(wire.image(frame.depth, frame.stamp_ns, OPTICAL), poses.pose))
+        frames.append(camera.frame(wire.image(frame.depth, frame.stamp_ns, OPTICAL), camera.look_up(poses)))
     return frames, moved, tracking
 
 

@@ -21,7 +21,7 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, Cloud, Scan, name_of
 from stereovox.se3 import Transform, apart
-from stereovox.sources.clock_watch import CLOCK, LATE, ClockDoubt, ClockWatch, Delays
+from stereovox.sources.clock_watch import CLOCK, LATE, START_NS, ClockDoubt, ClockWatch, Delays, Heard
 from stereovox.sources.poses import Poses
 from stereovox.track.tracker import Tracker
 
@@ -153,9 +153,9 @@ class CameraClock:
         delays: Their delays, which whoever receives them takes in.
         T_body_camera: (4, 4) float64, the mount.
         notify: Called with each line that a user should see.
-        option: What sets the clock by hand, for messages.
-        given_s: What it is set to, in seconds.
+        cure: Returns what the user can do, from the doubt and the seconds that the clock then is ahead of the poses'.
         background: Whether images are tracked in a thread.
+        start_ns: By how much images and poses of the same time may come apart at the start.
 
     Attributes:
         config: Settings, for tracking.
@@ -169,15 +169,15 @@ class CameraClock:
         delays: Delays,
         T_body_camera: Transform,
         config: Config,
-        notify: Callable[[str], None],
-        option: str,
-        given_s: float = 0.0,
+        notify: Callable[[str], object],
+        cure: Callable[[ClockDoubt, float], str],
         background: bool = True,
+        start_ns: int = START_NS,
     ):
         self.config, self.shift_ns = config, 0
         self._name, self._poses, self._mount = name, poses, T_body_camera
-        self._notify, self._option, self._given_s = notify, option, given_s
-        self._watch = ClockWatch(delays)
+        self._notify, self._how = notify, cure
+        self._delays, self._watch = delays, ClockWatch(delays, start_ns)
         self._motion: MotionClock | None = None
         self._doubt: ClockDoubt | None = None
         self._told_ns = 0
@@ -185,38 +185,49 @@ class CameraClock:
         self._seeing: Future[None] | None = None
         self._failed = ""
 
-    def heard(self, stamp_ns: int, arrived_ns: int) -> ClockDoubt | None:
-        """Take in the stamp of an image, corrected; return the doubt that the image is in, None: its stamp is right."""
-        return self._watch.heard(stamp_ns, arrived_ns)
+    def heard(self, stamp_ns: int, arrived_ns: int) -> Heard:
+        """Take in the stamp of an image, corrected. arrived_ns: monotonic."""
+        set_back = self._delays.set_back
+        return Heard(self._watch.heard(stamp_ns, arrived_ns), set_back)
 
-    def check(self, frame: AnyFrame | Scan, doubt: ClockDoubt | None, now_ns: int) -> None:
-        """Learn from an image, in its turn; raises FrameRefused where its pose is not certain.
+    def doubts(self, heard: Heard) -> bool:
+        """Return whether `check` has anything to do."""
+        return self._doubt_of(heard) is not None or heard.set_back != self._delays.set_back
+
+    def check(self, frame: AnyFrame | Scan, heard: Heard, now_ns: int) -> None:
+        """Learn from an image, in its turn; raises FrameRefused if its pose is not certain.
 
         frame: with the stamp that was `heard`. now_ns: monotonic.
         """
-        if doubt is None:
-            return
-        if doubt is self._watch.doubt:
+        doubt = self._doubt_of(heard)
+        if doubt is not None and doubt is self._watch.doubt:
             self._learn(frame, doubt, now_ns)
-        if doubt.cleared or (doubt.became not in (LATE, CLOCK) and self._rests(frame.stamp_ns, doubt)):
-            return
-        raise FrameRefused(
-            REASON, f"{name_of(frame)}: {doubt_words(doubt)}, and which is not known; {self._cure(doubt)}"
-        )
+        if doubt is not None and not doubt.cleared:
+            if doubt.became not in (LATE, CLOCK) and self._rests(frame.stamp_ns, doubt):
+                return
+            said = f"{doubt_words(doubt)}, and which is not known; {self._cure(doubt)}"
+            raise FrameRefused(REASON, f"{name_of(frame)}: {said}")
+        if heard.set_back != self._delays.set_back:
+            raise FrameRefused(REASON, f"{name_of(frame)}: the clock of the poses was set back while it waited")
 
     def close(self) -> None:
         """End what runs in the background."""
         if self._worker is not None:
             self._worker.shutdown(wait=False, cancel_futures=True)
 
+    def _doubt_of(self, heard: Heard) -> ClockDoubt | None:
+        return heard.doubt if heard.judged else heard.doubt or self._watch.doubt
+
     def _cure(self, doubt: ClockDoubt) -> str:
-        seconds = self._given_s - (self.shift_ns + doubt.off_ns) / 1e9
-        return f"move the camera until its motion shows it, or begin again with {self._option} {seconds:.3f}"
+        how = self._how(doubt, -(self.shift_ns + doubt.off_ns) / 1e9)
+        return how if self._failed else f"move the camera until its motion shows it, or {how}"
 
     def _learn(self, frame: AnyFrame | Scan, doubt: ClockDoubt, now_ns: int) -> None:
         """Track an image of an open doubt, and end the doubt where its motion says enough; tell the user of both."""
         if doubt is not self._doubt:
             self._doubt, self._motion, self._failed, self._told_ns = doubt, None, "", now_ns
+        if isinstance(frame, Cloud | Scan):
+            self._failed = "clouds and scans do not show it"
         if not doubt.told and (doubt.announced or now_ns - doubt.since_ns > TELL_NS):
             doubt.told, self._told_ns = True, now_ns
             self._notify(f"{self._name}: {doubt_words(doubt)}; images are left out while it moves; {self._cure(doubt)}")
@@ -224,10 +235,7 @@ class CameraClock:
             self._told_ns = now_ns
             why = self._failed or "its motion does not show it"
             self._notify(f"{self._name}: {doubt_words(doubt)}, and {why}; {self._cure(doubt)}")
-        if isinstance(frame, Cloud | Scan):
-            self._failed = "clouds and scans do not show it"
-            return
-        if self._seeing is not None and not self._seeing.done():
+        if isinstance(frame, Cloud | Scan) or (self._seeing is not None and not self._seeing.done()):
             return
         if self._motion is None:
             self._motion = MotionClock(self.config, self._mount, self._poses)

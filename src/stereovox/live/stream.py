@@ -26,7 +26,7 @@ from stereovox.opening import open_camera, open_images
 from stereovox.pose_choice import GIVEN, HOW, TRACK, has_poses
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.base import Stream, imu_of
-from stereovox.sources.clock_watch import OPEN, ClockDoubt, Delays
+from stereovox.sources.clock_watch import Delays, Heard
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
 from stereovox.sources.live_poses import LivePoses
@@ -98,11 +98,11 @@ class _Feed:
 
 
 class _Image(NamedTuple):
-    """An image that waits, and what is doubtful about its stamp."""
+    """An image that waits, and what was known of its stamp when it came."""
 
     feed: _Feed
     frame: AnyFrame
-    doubt: ClockDoubt | None
+    heard: Heard
 
 
 class LiveStream(Stream):
@@ -268,21 +268,24 @@ class LiveStream(Stream):
             return self._waiting.pop(self._ready), True
 
     def _ready(self, arrival: Arrival[_Image]) -> bool:
-        feed, frame, doubt = arrival.content
+        feed, frame, heard = arrival.content
         if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
             return True
-        if doubt is not None and doubt.became == OPEN and not doubt.told:
-            return False  # the next image may show that this one was late
+        if heard.is_open:
+            return False
         return self.poses.is_final(arrival.stamp_ns)
 
     def _clock_of(self, feed: _Feed, poses: LivePoses) -> CameraClock:
         given_s, mount = feed.camera.clock_offset_s, feed.camera.T_body_camera
-        option = "--clock-offset (clock_offset_s)"
-        return CameraClock(feed.name, poses, self._delays, mount, self.config, self._notify, option, given_s)
+
+        def cure(_: object, ahead_s: float) -> str:
+            return f"begin again with --clock-offset (clock_offset_s) {given_s + ahead_s:.3f}"
+
+        return CameraClock(feed.name, poses, self._delays, mount, self.config, self._notify, cure)
 
     def _framed(self, arrival: Arrival[_Image]) -> AnyFrame | None:
         """Return an image with its pose, or with a fault that says why it has none; None before the first pose."""
-        feed, image, doubt = arrival.content
+        feed, image, heard = arrival.content
         frame = replace(image, sensor=feed.name, stamp_ns=arrival.stamp_ns)
         self.moment = feed.moments.pop(image.stamp_ns, Moment(feed.name, None, arrival.arrived_ns))
         if self.poses is None or feed.tracked or (frame.fault and frame.fault not in POSE_FAULTS):
@@ -292,7 +295,7 @@ class LiveStream(Stream):
             return None
         try:
             if feed.clock is not None:
-                feed.clock.check(frame, doubt, monotonic_ns())
+                feed.clock.check(frame, heard, monotonic_ns())
             T_world_body = self.poses.at(frame.stamp_ns)
         except FrameRefused as refused:
             detail = f"{name_of(frame)}: {refused}"
@@ -307,9 +310,9 @@ class LiveStream(Stream):
             images = self._tracked(feed) if feed.tracked else self._noted(feed)
             for image in images:
                 stamp_ns = image.stamp_ns - feed.ahead_ns
-                doubt = feed.clock.heard(stamp_ns, monotonic_ns()) if feed.clock is not None else None
+                heard = feed.clock.heard(stamp_ns, monotonic_ns()) if feed.clock is not None else Heard()
                 with self._change:
-                    self._waiting.put(feed.name, stamp_ns, "", _Image(feed, image, doubt))
+                    self._waiting.put(feed.name, stamp_ns, "", _Image(feed, image, heard))
                     self._change.notify()
                 if self._stopped.is_set():
                     break

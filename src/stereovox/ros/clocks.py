@@ -7,16 +7,16 @@ the stamps of the poses. While these do not come steadily, nothing can be said, 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Protocol
 
 import numpy as np
 
-from stereovox.calibrate.live_clock import REASON, REMIND_NS, TELL_NS, doubt_words
-from stereovox.errors import FrameRefused
-from stereovox.sources.clock_watch import ANNOUNCED_NS, OPEN, ClockDoubt, ClockWatch, Delays
-from stereovox.sources.poses import seconds_from_ns
+from stereovox.calibrate.live_clock import CameraClock, PosesNow
+from stereovox.config import Config
+from stereovox.frame import AnyFrame
+from stereovox.sources.clock_watch import ANNOUNCED_NS, ClockDoubt, Delays, Heard
 
 WINDOW_NS, SPAN_NS, FEWEST = 1_000_000_000, 250_000_000, 3
 """Time over which the rate of poses is found; how long they must have come for it, and how many at least."""
@@ -80,108 +80,93 @@ class Pace:
         return rate if np.ptp(arrived - stamps / rate) <= (LIVE_OFF_NS if rate == 1 else PLAYED_OFF_NS) else unsteady
 
 
-class Heard(NamedTuple):
-    """What was said of a message when it arrived. doubt: that it is in. judged: whether anything could be said."""
+class PosesOfSensor(PosesNow, Protocol):
+    """Poses of a sensor in the world as they come. pace: None while nothing moves it."""
 
-    doubt: ClockDoubt | None
-    judged: bool
+    @property
+    def pace(self) -> Pace | None:
+        """How their messages arrive."""
+        ...
 
 
-NOTHING = Heard(None, False)
+class SensorClock(CameraClock):
+    """Watches the clock of one topic by time as it passes for the stamps of its poses.
 
-
-class SensorClock:
-    """Watches the clock of one topic against that of its poses, and tells the user.
-
-    apart_ns: by how much its messages and poses of the same time may come apart at the start.
+    Args: as for `CameraClock`. pace: of its poses. apart_ns: as `start_ns`.
     """
 
-    def __init__(self, topic: str, apart_ns: int, notify: Callable[[str], object]):
-        self._topic, self._apart_ns, self._notify = topic, apart_ns, notify
-        self._pace: Pace | None = None
-        self._watch = ClockWatch(Delays())
-        self._newest_ns: int | None = None
-        self._doubt: ClockDoubt | None = None
-        self._told_ns = 0
+    def __init__(
+        self, topic: str, poses: PosesNow, pace: Pace, config: Config, apart_ns: int, notify: Callable[[str], object],
+        background: bool = True,
+    ):  # fmt: skip
+        super().__init__(topic, poses, pace.delays, np.eye(4), config, notify, cure, background, apart_ns)
+        self.pace = pace
+        self._before_ns: int | None = None
 
-    def heard(self, stamp_ns: int, arrived_ns: int, pace: Pace | None) -> Heard:
-        """Take in the stamp of a message. arrived_ns: monotonic. pace: that of its poses; None: not known yet."""
-        back_ns = 0 if self._newest_ns is None else self._newest_ns - stamp_ns
-        self._newest_ns = stamp_ns
-        if pace is None:
-            return NOTHING
-        if pace is not self._pace:
-            self._pace, self._watch = pace, ClockWatch(pace.delays, self._apart_ns)
-        passed_ns, judged = pace.passed_ns(arrived_ns), pace.rate == pace.rate
-        if judged:
-            self._watch.heard(stamp_ns, passed_ns)
-        elif ANNOUNCED_NS < back_ns < BEGUN_AGAIN_NS and self._watch.doubt is None:
-            self._watch.doubt = ClockDoubt(back_ns, passed_ns, announced=True)
-        self._tell(arrived_ns)
-        doubt = self._watch.doubt
-        return Heard(doubt, judged and pace.delays.least_ns(passed_ns) is not None)
+    def heard(self, stamp_ns: int, arrived_ns: int) -> Heard:
+        """Take in the stamp of a message, corrected. arrived_ns: monotonic."""
+        back_ns, self._before_ns = (self._before_ns or stamp_ns) - stamp_ns, stamp_ns
+        passed_ns, set_back = self.pace.passed_ns(arrived_ns), self.pace.delays.set_back
+        if self.pace.rate == self.pace.rate:
+            judged = self.pace.delays.least_ns(passed_ns) is not None
+            return Heard(self._watch.heard(stamp_ns, passed_ns), set_back, judged)
+        if ANNOUNCED_NS < back_ns < BEGUN_AGAIN_NS:
+            self._watch.announce(back_ns, passed_ns)
+        return Heard(self._watch.doubt, set_back, judged=False)
 
-    def is_open(self, heard: Heard) -> bool:
-        """Return whether the next message may show that the stamp of this one is right."""
-        return heard.doubt is not None and heard.doubt.became == OPEN and not heard.doubt.told
 
-    def check(self, heard: Heard, stamp_ns: int) -> None:
-        """Raise FrameRefused `clock_doubt` for a message whose pose is not certain."""
-        doubt = heard.doubt if heard.judged or heard.doubt is not None else self._watch.doubt
-        if doubt is not None and not doubt.cleared:
-            raise FrameRefused(REASON, f"{self._topic} {seconds_from_ns(stamp_ns)}: {doubt_words(doubt)}; {CURE}")
-
-    def _tell(self, now_ns: int) -> None:
-        doubt = self._watch.doubt
-        if doubt is None:
-            return
-        if doubt is not self._doubt:
-            self._doubt, self._told_ns = doubt, now_ns
-        waited_ns = now_ns - self._told_ns
-        if not doubt.told and (doubt.announced or waited_ns > TELL_NS):
-            doubt.told, self._told_ns = True, now_ns
-            self._notify(
-                f"{self._topic}: {doubt_words(doubt)}; its messages are refused ({REASON}); {self._cure(doubt)}"
-            )
-        elif doubt.told and waited_ns > 3 * REMIND_NS:
-            self._told_ns = now_ns
-            self._notify(f"{self._topic}: still refused ({REASON}): {doubt_words(doubt)}; {self._cure(doubt)}")
-
-    def _cure(self, doubt: ClockDoubt) -> str:
-        late = f"; if it does take that long, give ros.apart_s {abs(doubt.off_ns) / 1e9 + 0.1:.1f}"
-        return f"{CURE}{late if doubt.start and abs(doubt.off_ns) < 5e9 else ''}"
+def cure(doubt: ClockDoubt, ahead_s: float) -> str:
+    """Say what the user can do about a doubt."""
+    late = f"; if it does take that long, give ros.apart_s {abs(doubt.off_ns) / 1e9 + 0.1:.1f}"
+    return f"{CURE}{late if doubt.start and abs(doubt.off_ns) < LATE_AT_MOST_NS else ''}"
 
 
 CURE = (
     "stamp sensor and poses by one clock (the driver's option for system time, chrony or PTP between machines; "
     "use_sim_time for all nodes or none), then start the node anew or call ~/reset"
 )
+LATE_AT_MOST_NS = 5_000_000_000
+"""Nothing takes longer to deliver than this."""
 
 
 class SensorClocks:
     """Those of all topics. apart_s: as `Options.apart_s`. notify: called with each line that a user should see.
 
-    Attributes:
-        refused: Messages that were refused, by topic.
+    background: whether images in doubt are tracked in threads.
     """
 
-    def __init__(self, apart_s: float, notify: Callable[[str], object]):
-        self._apart_ns, self._notify = round(1e9 * apart_s), notify
-        self.refused: Counter[str] = Counter()
-        self.forget()
+    def __init__(self, config: Config, apart_s: float, notify: Callable[[str], object], background: bool = True):
+        self._config, self._apart_ns, self._notify = config, round(1e9 * apart_s), notify
+        self._background, self._clocks = background, dict[str, SensorClock]()
 
-    def __getitem__(self, topic: str) -> SensorClock:
-        return self._clocks.setdefault(topic, SensorClock(topic, self._apart_ns, self._notify))
+    def shift_ns(self, topic: str) -> int:
+        """Return what is added to the stamps of a topic, as was found from its motion."""
+        clock = self._clocks.get(topic)
+        return clock.shift_ns if clock else 0
 
-    def refusal(self, topic: str, heard: Heard, stamp_ns: int) -> FrameRefused | None:
-        """Return why a message must not be mapped, and count it; None: its stamp is right as far as is known."""
-        try:
-            self[topic].check(heard, stamp_ns)
-        except FrameRefused as refused:
-            self.refused[topic] += 1
-            return refused
-        return None
+    def heard(self, topic: str, stamp_ns: int, arrived_ns: int, poses: PosesOfSensor) -> Heard:
+        """Take in the stamp of a message, with its shift. arrived_ns: monotonic."""
+        pace, clock = poses.pace, self._clocks.get(topic)
+        if pace is None:
+            return Heard(judged=False)
+        if clock is None or clock.pace is not pace:
+            if clock is not None:
+                clock.close()
+            clock = SensorClock(topic, poses, pace, self._config, self._apart_ns, self._notify, self._background)
+            self._clocks[topic] = clock
+        return clock.heard(stamp_ns, arrived_ns)
+
+    def check(self, topic: str, view: Callable[[], AnyFrame], heard: Heard, now_ns: int) -> None:
+        """Learn from a message, in its turn; raises FrameRefused if its pose is not certain.
+
+        view: returns what it shows of its sensor's motion, with the stamp that was `heard`. now_ns: monotonic.
+        """
+        clock = self._clocks.get(topic)
+        if clock is not None and clock.doubts(heard):
+            clock.check(view(), heard, clock.pace.passed_ns(now_ns))
 
     def forget(self) -> None:
         """Begin anew, as at the start."""
-        self._clocks: dict[str, SensorClock] = {}
+        for clock in self._clocks.values():
+            clock.close()
+        self._clocks.clear()

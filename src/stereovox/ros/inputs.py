@@ -60,13 +60,14 @@ class Input(Protocol):
         """Convert a message; the `fault` of the result says why it cannot be used. None: it is not to be mapped."""
         ...
 
-    def refused(self, data: bytes, why: FrameRefused) -> Frame | Cloud | Scan | None:
-        """Convert a message whose stamp is doubted, which nothing is to use; `why` is its fault."""
+    def look_up(self, poses: PoseBuffer) -> PoseLookup:
+        """Return what looks up the poses that `frame` asks for."""
+        return poses.pose
 
-        def nowhere(frame_id: str, stamp_ns: int) -> Pose:
-            raise why
-
-        return self.frame(data, nowhere)
+    def view(self, data: bytes, stamp_ns: int) -> Frame | Cloud:
+        """Return what a message shows of its sensor's motion: a depth image without its pose, else an empty cloud."""
+        name = _frame_title(self.topic, stamp_ns)
+        return Cloud(np.empty((0, 3), np.float32), NO_POSE, stamp_ns, name=name, sensor=self.topic)
 
 
 def header(data: bytes) -> tuple[int, str]:
@@ -99,6 +100,11 @@ class DepthInput(Input):
             return
         if camera != self._camera:  # keep the same object: tables are cached by it
             self._camera = camera
+
+    def view(self, data: bytes, stamp_ns: int) -> Frame | Cloud:
+        """Return a depth image without its pose; an empty cloud where it cannot be read."""
+        image = DepthInput.frame(self, data, lambda *_: Pose(NO_POSE, NO_POSE, 0))
+        return super().view(data, stamp_ns) if image.fault else replace(image, stamp_ns=stamp_ns)
 
     def frame(self, data: bytes, where: PoseLookup) -> Frame:
         """Convert a depth image."""

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from stereovox import se2
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
-from stereovox.frame import Cloud, Frame, Scan
+from stereovox.frame import Scan
 from stereovox.localize.amcl.localise import Localiser
 from stereovox.localize.robot_track import check_start
 from stereovox.localize.slam.pipeline import Slam, SlamResult
@@ -269,14 +269,13 @@ class LocalizingScanInput(ScanInput):
         """Return whether the odometry's pose is final."""
         return self._localizer.poses.odometry_is_final(frame_id, stamp_ns)
 
-    def refused(self, data: bytes, why: FrameRefused) -> Frame | Cloud | Scan | None:
-        """Leave a scan out whose stamp is doubted."""
-        self._localizer.refused[why.reason] += 1
-        return ScanInput(self.topic).refused(data, why) if self._mapped else None
+    def look_up(self, poses: PoseBuffer) -> PoseLookup:
+        """Return what looks poses up in the odometry's world."""
+        return self._localizer.poses.odometry
 
     def frame(self, data: bytes, where: PoseLookup) -> Scan | None:
         """Localise by a scan; return it with its pose in the map where it is to be mapped."""
-        scan = self.scan(data, self._localizer.poses.odometry)
+        scan = self.scan(data, where)
         try:
             found = self._localizer.locate(scan)
         except FrameRefused as refusal:

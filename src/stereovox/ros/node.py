@@ -10,27 +10,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import replace
 from time import monotonic_ns
 from typing import Any, NamedTuple
 
-from stereovox.errors import StereovoxError
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Cloud, Frame, UpdateReport
 from stereovox.rebuild import CorrectionReport
-from stereovox.ros.clocks import NOTHING, Heard, SensorClocks
+from stereovox.ros.clocks import SensorClocks
 from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
-from stereovox.ros.inputs import header
+from stereovox.ros.inputs import PoseLookup, header
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.obstacles import Obstacles
 from stereovox.ros.options import Options
 from stereovox.ros.outputs import Outputs
 from stereovox.ros.pose_source import pose_source
-from stereovox.ros.poses import fixed_transform
+from stereovox.ros.poses import Pose, SensorPoses, fixed_transform
 from stereovox.ros.score import score_of
 from stereovox.ros.services import Services
 from stereovox.ros.stamps import StampsByNode
 from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses
 from stereovox.se3 import inverse
+from stereovox.sources.clock_watch import Heard
 from stereovox.sources.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
@@ -40,10 +42,11 @@ MAX_AT_ONCE = 256
 
 
 class Message(NamedTuple):
-    """A message to map, as bytes, and what its stamp was found to be when it arrived."""
+    """A message to map, as bytes; what was known of its stamp when it arrived, and what was added to it."""
 
     data: bytes
-    heard: Heard
+    heard: Heard = Heard()
+    shift_ns: int = 0
 
 
 class MapNode:
@@ -83,7 +86,7 @@ class MapNode:
         self.waiting: Waiting[Message] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
         self.received: Counter[str] = Counter()
         self._poses.tf.simulated = bool(node.get_parameter("use_sim_time").value)
-        self._clocks = SensorClocks(options.apart_s, lambda line: node.get_logger().warning(line))
+        self._clocks = SensorClocks(mapping.config, options.apart_s, lambda line: node.get_logger().warning(line))
         self._outputs = Outputs(node, mapping, options, self.counts)
         self._obstacles = Obstacles(node, mapping, options)
         Services(node, mapping, out, self._renewed, self._source.continuable)
@@ -99,7 +102,6 @@ class MapNode:
         history = self._mapping.history
         return {
             "received": self.received.total(),
-            "clock_doubt": self._clocks.refused.total(),
             "dropped": self.waiting.dropped.total(),
             "waiting": len(self.waiting),
             "frames_in_map": history.frames,
@@ -137,6 +139,7 @@ class MapNode:
             self._map(arrival)
         for ended in self._mapping.corrections.rest():
             self._take(ended)
+        self._clocks.forget()
         self._outputs.close()
         error = self._score.final() if self._score is not None else {}
         return {**self._source.finish(), **({"error": error} if error else {})}
@@ -156,31 +159,34 @@ class MapNode:
         self.received[topic] += 1
         try:
             stamp_ns, frame_id = header(data)
-            self._stamps.heard(stamp_ns)
-            heard = self._heard(topic, frame_id, stamp_ns)
         except ValueError:  # no pose to wait for: it is refused in its turn
-            stamp_ns, frame_id, heard = 0, "", NOTHING
-        self.waiting.put(topic, stamp_ns, frame_id, Message(data, heard))
+            self.waiting.put(topic, 0, "", Message(data))
+            return
+        shift_ns = self._clocks.shift_ns(topic)
+        stamp_ns += shift_ns
+        self._stamps.heard(stamp_ns)
+        self.waiting.put(topic, stamp_ns, frame_id, Message(data, self._heard(topic, frame_id, stamp_ns), shift_ns))
 
     def _heard(self, topic: str, frame_id: str, stamp_ns: int) -> Heard:
         arrived_ns = self._subscriptions.arrived_ns
         if isinstance(self._poses, TrackedPoses) and isinstance(self._inputs[topic], TrackedDepthInput):
             self._poses.images.heard(stamp_ns, arrived_ns)
-            return NOTHING
-        return self._clocks[topic].heard(stamp_ns, arrived_ns, self._poses.pace(frame_id))
+            return Heard()
+        return self._clocks.heard(topic, stamp_ns, arrived_ns, SensorPoses(self._poses, frame_id))
 
     def _ready(self, one: Arrival[Message]) -> bool:
         sensor = self._inputs[one.sensor]
-        if self._clocks[one.sensor].is_open(one.content.heard):
+        if one.content.heard.is_open or not sensor.ready:
             return False
-        return sensor.ready and sensor.is_final(self._poses, one.frame_id, one.stamp_ns)
+        return sensor.is_final(self._poses, one.frame_id, one.stamp_ns)
 
     def _map(self, one: Arrival[Message]) -> None:
-        sensor, (data, heard) = self._inputs[one.sensor], one.content
-        doubt = self._clocks.refusal(one.sensor, heard, one.stamp_ns) if sensor.ready else None
-        frame = sensor.frame(data, self._poses.pose) if doubt is None else sensor.refused(data, doubt)
+        sensor, shift_ns = self._inputs[one.sensor], one.content.shift_ns
+        frame = sensor.frame(one.content.data, self._look_up(one))
         if frame is None:  # it told where the robot is, and is not to be mapped
             return
+        if shift_ns:
+            frame = replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
         report = self._mapping.add(frame)
         self._on_report(report)
         if self._corrector is not None and isinstance(frame, Frame | Cloud) and not frame.fault:
@@ -191,6 +197,22 @@ class MapNode:
             self._outputs.changed(one.stamp_ns, self._poses.world)
             where = self._poses.pose(one.frame_id, one.stamp_ns)  # once more: where the robot is
             self._obstacles.seen(one.stamp_ns, self._poses.world, where.T_world_sensor @ inverse(where.T_base_sensor))
+
+    def _look_up(self, one: Arrival[Message]) -> PoseLookup:
+        """Return what looks poses up for a message by the stamps that it bears, or refuses to if they are in doubt."""
+        sensor, (data, heard, shift_ns) = self._inputs[one.sensor], one.content
+        look_up = sensor.look_up(self._poses)
+        try:
+            if sensor.ready and one.frame_id:
+                self._clocks.check(one.sensor, lambda: sensor.view(data, one.stamp_ns), heard, monotonic_ns())
+        except FrameRefused as refused:
+            doubt = refused  # lives longer than this clause
+
+            def nowhere(frame_id: str, stamp_ns: int) -> Pose:
+                raise doubt
+
+            return nowhere
+        return lambda frame_id, stamp_ns: look_up(frame_id, stamp_ns + shift_ns)
 
     def _take(self, ended: Future[CorrectionReport]) -> None:
         """Publish what a correction has changed, or say why it has not."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from threading import RLock
 from time import monotonic_ns
 from typing import NamedTuple
 
@@ -18,6 +20,7 @@ from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import StampedTransform, frame_name, read_odometry, read_transforms
 from stereovox.sources.bags.tf import Edge, Limits, Tf, tf_poses
 from stereovox.sources.live_poses import REORDERED_NS, RESET_NS, SET_BACK
+from stereovox.sources.poses import Poses, seconds_from_ns
 from stereovox.sources.robots.frames import BASES
 
 MAX_TRANSFORMS = 2000
@@ -33,8 +36,9 @@ class _Late(NamedTuple):
 
 
 class LiveEdge(Edge):
-    """Recent poses of a frame in its parent. arrived: returns when the transform that is added arrived, monotonic.
-    simulated: as for `Pace`.
+    """Recent poses of a frame in its parent; one thread may add some while others ask.
+
+    arrived: returns when the transform that is added arrived, monotonic. simulated: as for `Pace`.
 
     A frame that has not moved may still move: unlike in a recording, it is never treated as fixed.
 
@@ -50,23 +54,32 @@ class LiveEdge(Edge):
         self.pace, self._arrived = Pace(simulated), arrived
         self._newest_ns: int | None = None
         self._late: list[_Late] = []
+        self._lock = RLock()
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
         """Add tx ty tz qx qy qz qw at a time."""
         one = _Late(int(stamp_ns), tuple(numbers), self._arrived())
         self.pace.heard(one.stamp_ns, one.arrived_ns)
-        if self._newest_ns is not None and one.stamp_ns < self._newest_ns - RESET_NS:
-            self.clear()
-        if self._newest_ns is None or one.stamp_ns > self._newest_ns:
-            self._put_late()
-            self._put(one)
-        elif one.stamp_ns < self._newest_ns:
-            self._take_late(one, self._newest_ns)
+        with self._lock:
+            if self._newest_ns is not None and one.stamp_ns < self._newest_ns - RESET_NS:
+                self.clear()
+            if self._newest_ns is None or one.stamp_ns > self._newest_ns:
+                self._put_late()
+                self._put(one)
+            elif one.stamp_ns < self._newest_ns:
+                self._take_late(one, self._newest_ns)
 
     def clear(self) -> None:
         """Drop all poses so far."""
-        self._keep(0)
-        self._late, self._newest_ns, self._sorted = [], None, None
+        with self._lock:
+            self._keep(0)
+            self._late, self._newest_ns, self._sorted = [], None, None
+
+    def stamps(self, first_ns: int, last_ns: int) -> list[int]:
+        """Return the times of the transforms in a stretch of time, with one more at either end."""
+        stamps, _ = self._in_order()
+        begin = max(int(np.searchsorted(stamps, first_ns)) - 1, 0)
+        return stamps[begin : int(np.searchsorted(stamps, last_ns)) + 1].tolist()
 
     def _take_late(self, one: _Late, newest_ns: int) -> None:
         if self._late and one.stamp_ns <= self._late[-1].stamp_ns:
@@ -103,9 +116,11 @@ class LiveEdge(Edge):
         del self._rows[: len(self._rows) - 7 * newest]
 
     def _in_order(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        ordered = super()._in_order()
-        self._still = False
-        return ordered
+        with self._lock:
+            return super()._in_order()
+
+    def _is_still(self, rows: NDArray[np.float64]) -> bool:
+        return False
 
 
 class LiveTf(Tf):
@@ -125,13 +140,13 @@ class LiveTf(Tf):
         assert isinstance(edge, LiveEdge)
         edge.clear()
 
-    def pace(self, target: str, source: str) -> Pace | None:
-        """Return how transforms arrive of what moves next to `source`; None where nothing moves or connects them."""
+    def mover(self, target: str, source: str) -> LiveEdge | None:
+        """Return what moves next to `source`; None where nothing moves or connects them."""
         try:
             up, down = self._path(frame_name(target), frame_name(source))
         except FrameRefused:
             return None
-        return next((one.pace for one in (*down, *up) if isinstance(one, LiveEdge) and not one.fixed), None)
+        return next((one for one in (*down, *up) if isinstance(one, LiveEdge) and not one.fixed), None)
 
     def _new_edge(self, parent: str, child: str) -> Edge:
         def arrived() -> int:
@@ -146,6 +161,33 @@ class Pose(NamedTuple):
     T_world_sensor: Transform
     T_base_sensor: Transform
     off_ns: int
+
+
+class SensorPoses:
+    """Poses of a frame in the world as they come; raises FrameRefused where one would be extrapolated."""
+
+    def __init__(self, poses: PoseBuffer, frame_id: str):
+        self._poses, self._frame_id = poses, frame_id
+
+    @property
+    def pace(self) -> Pace | None:
+        """How their messages arrive; None while nothing moves the frame."""
+        return self._poses.pace(self._frame_id)
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return T_world_frame (4, 4) at a time."""
+        pose = self._poses.pose(self._frame_id, stamp_ns)
+        if pose.off_ns:
+            raise FrameRefused("no_pose", f"{self._frame_id} has no pose at {seconds_from_ns(stamp_ns)} s")
+        return pose.T_world_sensor
+
+    def between(self, first_ns: int, last_ns: int) -> Poses | None:
+        """Return the poses of a stretch of time, with one more at either end; None where there are fewer than two."""
+        mover, found = self._poses.mover(self._frame_id), dict[int, Transform]()
+        for stamp_ns in mover.stamps(first_ns, last_ns) if mover else ():
+            with suppress(FrameRefused):
+                found[stamp_ns] = self.at(stamp_ns)
+        return Poses(list(found), list(found.values()), where="/tf") if len(found) > 1 else None
 
 
 class PoseBuffer:
@@ -203,12 +245,17 @@ class PoseBuffer:
         self.world, self._base = world, base
         return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
 
-    def pace(self, frame_id: str) -> Pace | None:
-        """Return how the poses of a frame in the world arrive; None where it is not known."""
+    def mover(self, frame_id: str) -> LiveEdge | None:
+        """Return what moves a frame in the world; None where it is not known."""
         try:
-            return self.tf.pace(self._world_of(frame_id), frame_id)
+            return self.tf.mover(self._world_of(frame_id), frame_id)
         except FrameRefused:
             return None
+
+    def pace(self, frame_id: str) -> Pace | None:
+        """Return how the poses of a frame in the world arrive; None where it is not known."""
+        mover = self.mover(frame_id)
+        return mover.pace if mover else None
 
     def _add(self, one: StampedTransform, fixed: bool = False) -> None:
         self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)

@@ -111,6 +111,10 @@ class TrackedPoses(PoseBuffer):
         T_world_sensor = self._way.at(stamp_ns, self.tf.limits, "tracked") @ T_body_sensor
         return Pose(T_world_sensor, T_body_sensor, self._way.off_ns(stamp_ns))
 
+    def mover(self, frame_id: str) -> LiveEdge | None:
+        """Return what the tracked poses are kept in."""
+        return self._way
+
     def pace(self, frame_id: str) -> Pace | None:
         """Return how the images arrive that poses come from."""
         return self.images
@@ -196,7 +200,11 @@ class TrackedDepthInput(DepthInput):
 
     def frame(self, data: bytes, where: PoseLookup) -> Frame:
         """Convert a depth image; its pose is tracked."""
-        return self._tracking.track(super().frame(data, self._tracking.mounted))
+        return self._tracking.track(super().frame(data, where))
+
+    def look_up(self, poses: PoseBuffer) -> PoseLookup:
+        """Return what tells how the camera is mounted."""
+        return self._tracking.mounted
 
     def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
         """Return whether it is known how the camera is mounted."""

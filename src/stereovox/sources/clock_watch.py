@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 from threading import Lock
+from typing import NamedTuple
 
 WINDOW_NS = 1_000_000_000
 """Time over which the least delay counts."""
@@ -29,10 +30,14 @@ clock was set."""
 
 
 class Delays:
-    """The least delay from stamp to arrival within the last second. Threads may share it."""
+    """The least delay from stamp to arrival within the last second. Threads may share it.
+
+    Attributes:
+        set_back: How often the stamps went back.
+    """
 
     def __init__(self) -> None:
-        self._lock, self._newest_ns = Lock(), 0
+        self._lock, self._newest_ns, self.set_back = Lock(), 0, 0
         self._least: deque[tuple[int, int]] = deque()  # arrival and delay; delays ascend
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> None:
@@ -41,7 +46,7 @@ class Delays:
         with self._lock:
             if stamp_ns < self._newest_ns - ANNOUNCED_NS:
                 self._least.clear()
-                self._newest_ns = stamp_ns
+                self._newest_ns, self.set_back = stamp_ns, self.set_back + 1
             self._newest_ns = max(self._newest_ns, stamp_ns)
             while self._least and self._least[-1][1] >= delay_ns:
                 self._least.pop()
@@ -85,6 +90,24 @@ class ClockDoubt:
     def cleared(self) -> bool:
         """Whether the stamps of its images have turned out to be right."""
         return self.became == LATE or (self.became == GONE and not self.announced)
+
+
+class Heard(NamedTuple):
+    """What was known of the stamp of a message when it arrived.
+
+    doubt: what it is in; None: nothing. set_back: how often the clock of the poses had been. judged: whether anything
+    could be said; else it shares a doubt that comes up later.
+    """
+
+    doubt: ClockDoubt | None = None
+    set_back: int = 0
+    judged: bool = True
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the next message may show that this one was late."""
+        doubt = self.doubt
+        return doubt is not None and doubt.became == OPEN and not (doubt.told or doubt.announced)
 
 
 class ClockWatch:
@@ -136,6 +159,11 @@ class ClockWatch:
         self.doubt.announced |= backwards
         self.doubt.off_ns = least_ns - poses_ns - (self._usual_ns or 0)
         return self.doubt
+
+    def announce(self, back_ns: int, arrived_ns: int) -> None:
+        """Say that a stamp went back while nothing could be said of arrivals."""
+        if self.doubt is None:
+            self.doubt = ClockDoubt(back_ns, arrived_ns, announced=True)
 
     def late(self) -> None:
         """Say that the stamps are right: images come as much later, or earlier, as they do now."""

@@ -125,8 +125,11 @@ class Edge:
             stamps, first = np.unique(np.array(self._stamps, np.int64), return_index=True)
             rows = np.array(self._rows, float).reshape(-1, 7)[first]
             self._sorted = stamps, rows
-            self._still = len(rows) > 1 and bool(np.abs(rows - rows[0]).max() <= STILL)
+            self._still = self._is_still(rows)
         return self._sorted
+
+    def _is_still(self, rows: NDArray[np.float64]) -> bool:
+        return len(rows) > 1 and bool(np.abs(rows - rows[0]).max() <= STILL)
 
 
 class Tf:
@@ -248,7 +251,8 @@ class Tf:
         return tuple(chain)
 
     def _path(self, target: str, source: str) -> EdgePath:
-        if (target, source) not in self._paths:
+        found = self._paths.get((target, source))
+        if found is None:
             up, down = self._chain(target), self._chain(source)
             roots = [chain[-1].parent if chain else frame for chain, frame in ((up, target), (down, source))]
             if roots[0] != roots[1]:
@@ -258,8 +262,8 @@ class Tf:
                 raise FrameRefused("no_pose", f"{self.where}: nothing connects {parts}; record what joins them")
             while up and down and up[-1] is down[-1]:
                 up, down = up[:-1], down[:-1]
-            self._paths[target, source] = up, down
-        return self._paths[target, source]
+            self._paths[target, source] = found = up, down
+        return found
 
     def _along(self, edges: tuple[Edge, ...], stamp_ns: int) -> Transform:
         """Return T_ancestor_frame of the edges from a frame up to its ancestor."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks of sensors that are not those of the poses are told; replays at any rate, pauses and loops are not."""
 
+import made_streams
 import numpy as np
 import pytest
 import wire
@@ -146,9 +147,10 @@ def test_sensors_that_take_long_from_the_start_are_mapped_where_that_is_allowed(
     assert (allowed.told, allowed.doubted, max(allowed.mapped) < 0.001) == ([], 0, True)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.03])
 @pytest.mark.parametrize("step_s", [-0.4, 0.4])
-def test_poses_of_a_clock_that_is_set_do_not_mix_with_older_ones(step_s):
-    drive = Drive(pose_step=lambda s: step_s if s > 3 else 0)
+def test_poses_of_a_clock_that_is_set_do_not_mix_with_older_ones(step_s, late_s):
+    drive = Drive(pose_step=lambda s: step_s if s > 3 else 0, late=lambda s: late_s)
     assert len(drive.told) == 1
     assert drive.doubted > 60
     assert max(drive.mapped) < 0.021  # across the step it lies between poses of either clock
@@ -224,3 +226,40 @@ def test_when_a_message_was_received_counts_not_when_it_is_read(monkeypatch):
     monkeypatch.setattr("stereovox.ros.subscriptions.monotonic_ns", lambda: 90 * S)
     assert arrived({"received_timestamp": START + 3 * S}) == 88 * S
     assert arrived({"received_timestamp": 0}) == arrived({}) == arrived({"received_timestamp": START + 6 * S}) == 90 * S
+
+
+@pytest.fixture
+def domain(monkeypatch, domains):
+    rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domains[1]))
+    rclpy.init(args=[])
+    yield
+    rclpy.shutdown()
+
+
+def on_time(s: float) -> float:
+    return 0.0
+
+
+@pytest.mark.parametrize(
+    ("topics", "pose_step", "off_s"),
+    [
+        ({"/b": on_time, "/a": lambda s: 100.0}, on_time, 100.0),
+        ({"/a": on_time}, lambda s: -0.4 if s > 0.5 else 0.0, 0.4),
+    ],
+    ids=["second-camera", "poses"],
+)
+def test_the_node_finds_clocks_by_motion_and_maps_nothing_at_a_wrong_pose(
+    topics, pose_step, off_s, domain, monkeypatch
+):
+    told = made_streams.stream(monkeypatch, topics, pose_step, count=62)
+    assert max(max(one) for one in told.wrong_m.values()) < 0.03
+    assert len(told.wrong_m["/a"]) > 15
+    assert max(told.taken_s["/a"]) > 1.9
+    assert set(told.refused) == {"/a"}
+    assert set(told.refused["/a"]) <= {"clock_doubt", "out_of_order", "no_pose", "pose_extrapolated"}
+    (noticed_s, first), (found_s, then) = told.lines
+    assert first.startswith("/a: images come ")
+    assert noticed_s < found_s < 1.7
+    assert float(then.split("its clock is ")[1].split()[0]) == pytest.approx(off_s, abs=0.02)

@@ -109,9 +109,19 @@ def test_the_queue_is_bounded(clock):
     waiting = queue(clock, most=3)
     for n in range(8):
         waiting.put("s", n, "f", f"{n}")
-    assert len(waiting) == 3
-    assert taken(waiting, always) == ["5", "6", "7"]
-    assert waiting.dropped == {"s": 5}
+    assert len(waiting) == 4
+    assert taken(waiting, always) == ["4", "5", "6", "7"]
+    assert waiting.dropped == {"s": 4}
+
+
+def test_what_waits_for_longer_than_the_queue_holds_is_returned_as_it_is(clock):
+    waiting, came = queue(clock, most=3), []
+    for n in range(8):
+        clock.now = n * MS
+        waiting.put("s", n, "f", f"{n}")
+        came += taken(waiting, never)
+    assert came == list("01234")
+    assert not waiting.dropped
 
 
 def test_a_frame_is_late_by_when_it_was_ready_not_by_when_its_turn_came(clock):

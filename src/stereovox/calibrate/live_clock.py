@@ -35,6 +35,8 @@ BEFORE_NS, AFTER_NS = 500_000_000, 300_000_000
 """How much longer a camera may take to deliver an image than poses take to come, and how much less."""
 GRID_NS, ALIKE_NS = 20_000_000, 100_000_000
 """Between the offsets that are tried, and by which two differ that are not told from each other."""
+APART = 0.4
+"""The same for small changes of the delay, as a share: zero must be told from all of it."""
 PAIR_NS, LONGEST_NS, MOST_PAIRS = 200_000_000, 450_000_000, 60
 """Time between the two images of a pair, at least and at most, and how many of the last pairs are compared."""
 FEWEST, COVERED = 8, 0.6
@@ -84,10 +86,10 @@ class MotionClock:
         self._tracked = [one for one in self._tracked if 0 < now_ns - one[0] <= LONGEST_NS] + [(now_ns, T_now)]
         del self._pairs[:-MOST_PAIRS]
 
-    def shift_ns(self, low_ns: int, high_ns: int) -> int | None:
+    def shift_ns(self, low_ns: int, high_ns: int, alike_ns: int = ALIKE_NS) -> int | None:
         """Return what must be added to stamps, between two limits, to be those of the poses; None: it is not certain.
 
-        Zero, and whatever lies near it, is among those that are tried.
+        Zero, and whatever lies near it, is among those that are tried. alike_ns: by which two may differ that both fit.
         """
         if len(self._pairs) < FEWEST:
             return None
@@ -101,15 +103,17 @@ class MotionClock:
         usual = np.full(len(shifts), np.inf)
         usual[known] = np.nanmean(misfits[known], axis=1)
         best = int(np.argmin(usual))
-        if usual[best] > EXPLAINED * moved or not self._is_unique(shifts, misfits, usual, best):
+        if usual[best] > EXPLAINED * moved or not self._is_unique(
+            np.abs(shifts - shifts[best]) > alike_ns, misfits, usual, best
+        ):
             return None
         return int(shifts[best])
 
     def _is_unique(
-        self, shifts: NDArray[np.int64], misfits: NDArray[np.float64], usual: NDArray[np.float64], best: int
+        self, others: NDArray[np.bool_], misfits: NDArray[np.float64], usual: NDArray[np.float64], best: int
     ) -> bool:
-        """Return whether all offsets that are not those near the best fit clearly worse, as far as poses are known."""
-        for k in np.flatnonzero(np.isfinite(usual) & (np.abs(shifts - shifts[best]) > ALIKE_NS)):
+        """Return whether all other offsets fit clearly worse, as far as poses are known."""
+        for k in np.flatnonzero(np.isfinite(usual) & others):
             both = np.isfinite(misfits[k]) & np.isfinite(misfits[best])
             here, there = misfits[best][both].sum(), misfits[k][both].sum()
             if there < UNIQUE * here or there - here < SURE:
@@ -249,18 +253,19 @@ class CameraClock:
         try:
             motion.see(frame)
             low_ns, high_ns = _range(doubt)
-            shift_ns = motion.shift_ns(low_ns, high_ns)
+            alike_ns = ALIKE_NS if doubt.start else min(ALIKE_NS, round(APART * abs(doubt.off_ns)))
+            shift_ns = motion.shift_ns(low_ns, high_ns, alike_ns)
         except StereovoxError as error:
             self._failed = str(error)
             return
         if shift_ns is None or doubt is not self._watch.doubt:
             return
         late = f"by {doubt.off_ns / 1e9:+.2f} s"
-        if abs(shift_ns) <= ALIKE_NS:
+        if abs(shift_ns) <= alike_ns:
             self._watch.late()
             self._notify(f"{self._name}: its motion shows that images come later {late}, and stamps are right")
             return
-        if not doubt.start and abs(shift_ns - doubt.off_ns) <= ALIKE_NS:
+        if not doubt.start and abs(shift_ns - doubt.off_ns) <= alike_ns:
             shift_ns = doubt.off_ns  # arrivals say it more exactly
         self.shift_ns += shift_ns
         self._watch.corrected()

@@ -30,9 +30,10 @@ class Arrival(Generic[T]):
 class Waiting(Generic[T]):
     """A short queue for each sensor. Frames of one sensor keep their order.
 
-    max_length: frames that wait per sensor; one more drops the oldest. wait_ns: a frame that is not ready after this
-    time is returned as it is. late_ns: a frame that has been ready this long is dropped where a newer one is ready too.
-    dropped: number of dropped frames by sensor. clock: monotonic nanoseconds.
+    max_length: frames that wait per sensor; one more drops the oldest, or returns it as it is if it is not ready.
+    wait_ns: a frame that is not ready after this time is returned as it is. late_ns: a frame that has been ready this
+    long is dropped where a newer one is ready too. dropped: number of dropped frames by sensor. clock: monotonic
+    nanoseconds.
     """
 
     def __init__(self, max_length: int, wait_ns: int, late_ns: int, clock: Callable[[], int]):
@@ -46,7 +47,7 @@ class Waiting(Generic[T]):
     def put(self, sensor: str, stamp_ns: int, frame_id: str, content: T) -> None:
         """Add a message to the queue of its sensor."""
         queue = self._queues.setdefault(sensor, deque())
-        if len(queue) == self._max_length:
+        if len(queue) > self._max_length or (len(queue) == self._max_length and queue[0].ready_ns is not None):
             self._drop(queue)
         queue.append(Arrival(sensor, stamp_ns, frame_id, content, self._clock()))
 
@@ -59,7 +60,8 @@ class Waiting(Generic[T]):
         for queue in self._queues.values():
             for one in queue:  # also behind the first: how long a frame has been ready counts while others are mapped
                 self._note(one, is_ready, now)
-        due = [queue for queue in self._queues.values() if queue and self._due(queue[0], now)]
+        full = self._max_length + 1
+        due = [queue for queue in self._queues.values() if queue and (len(queue) == full or self._due(queue[0], now))]
         for queue in due:
             while len(queue) > 1 and self._late(queue[0], now) and self._due(queue[1], now):
                 self._drop(queue)

@@ -4,6 +4,7 @@
 import signal
 
 import pytest
+from made_domains import domains  # noqa: F401 - a fixture
 from xdist.scheduler import WorkStealingScheduling
 
 from made_bucket import s3, where  # noqa: F401 - fixtures

@@ -37,6 +37,16 @@ def refused(capsys):
     return run
 
 
+def test_merge_of_maps_that_lost_most_of_their_frames_says_so(tmp_path, capsys):
+    for seed in (1, 2):
+        one = random_map(seed)
+        one.history.frames = 2
+        one.history.refused["no_pose"] = 5
+        one.save(tmp_path / f"{seed}.svox")
+    assert main(["merge", str(tmp_path / "1.svox"), str(tmp_path / "2.svox"), "--out", str(tmp_path / "c.svox")]) == 3
+    assert "c.svox, but only 4 of 14 frames of both are in the map; look" in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_crop(maps, tmp_path, told, refused):
     out = tmp_path / "part.svox"
     result = told("crop", maps / "a.svox", out, "--box=-0.5,-inf,0,0.5,inf,1")

@@ -2,6 +2,7 @@
 """`simulate`, `slam`, `localize`, `grid`, and `map` under a profile of two dimensions: a robot's bag becomes a map."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,23 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
     assert result["position_rms_m"] < 0.1
     assert result["scans"] == len(way)
     np.testing.assert_array_equal(read_map_server(tmp_path / "again.yaml").cells, floor.cells)
+
+
+@pytest.mark.parametrize("command", ["slam", "localize"])
+def test_scans_that_are_mostly_lost_are_told_last(command, bag, reference, tmp_path, capsys, monkeypatch):
+    robot, out = open_robot(bag), tmp_path / ("a.yaml" if command == "slam" else "a.tum")
+    scans = [
+        one if k % 3 == 0 else replace(one, ranges=np.full_like(one.ranges, np.nan))
+        for k, one in enumerate(robot.scans)
+    ]
+    robot.scans = scans
+    monkeypatch.setattr(f"stereovox.cli.{command}.open_noting", lambda source: robot)
+    files = [] if command == "slam" else [reference, "--start=0,0,0"]
+    assert main([command, str(bag), *map(str, files), "--out", str(out), "--json"]) == 3
+    said = capsys.readouterr()
+    kept = len(scans[::3])
+    assert f", but only {kept} of {len(scans)} scans" in said.err.splitlines()[-1]
+    assert "mostly_lost" in [doubt["kind"] for doubt in json.loads(said.out.splitlines()[-1])["doubts"]]
 
 
 @pytest.mark.parametrize(

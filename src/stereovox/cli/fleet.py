@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.options import add_settings, overrides
 from stereovox.cli.terminal import (
+    but_few,
     cells_line,
     command_line,
     progress_of_steps,
@@ -100,4 +101,4 @@ def _say_map(made: FleetMap) -> None:
     frames, were = many(made.map.frames, "frame"), "was" if mapped == 1 else "were"
     say(f"{frames}, each in {made.overlap:.1f} of {_boxes(boxes)}, {mapped} of which {were} mapped now")
     say(cells_line({**made.map.counts(), "memory_bytes": made.map.memory_bytes}))
-    say(f"saved in {made.out}; look at it with: {command_line('view', made.out)}")
+    say(f"saved in {made.out}{but_few(made.summary())}; look at it with: {command_line('view', made.out)}")

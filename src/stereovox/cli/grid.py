@@ -15,6 +15,7 @@ from stereovox.cli.localize import add_start
 from stereovox.cli.options import add_checkpoint, overrides
 from stereovox.cli.robots import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
+    but_few,
     cells_line,
     first_included,
     milliseconds,
@@ -85,6 +86,6 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
     times = f"scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}"
     say(f"per reading: {times}{first_included(result)}")
     say(cells_line(result))
-    say(f"saved in {out.with_suffix('.yaml')}; look at it with: {picture_line(out)}")
+    say(f"saved in {out.with_suffix('.yaml')}{but_few(result)}; look at it with: {picture_line(out)}")
     if not result["occupied"] and not result["free"]:
         say("note: no cell is known yet: a single reading is too little evidence; map more")

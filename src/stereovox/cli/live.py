@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.options import add_checkpoint, add_settings, check_ending, heights_of, overrides
 from stereovox.cli.terminal import (
+    but_few,
     cells_line,
     command_line,
     milliseconds,
@@ -149,5 +150,4 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     say(cells_line(result))
     for why in failures:
         say(f"not written: {why}")
-    few = "".join(f", but {doubt['text']}" for doubt in result.get("doubts", ()) if doubt.get("kind") == "mostly_lost")
-    say(f"saved in {arguments.out}{few}; look at it with: {command_line('view', arguments.out)}")
+    say(f"saved in {arguments.out}{but_few(result)}; look at it with: {command_line('view', arguments.out)}")

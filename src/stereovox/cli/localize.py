@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stereovox.cli.robots import add_robot, open_noting, print_trajectory_error, settings_of
-from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
+from stereovox.cli.terminal import but_few, progress_of_steps, say, say_about_compiling
 from stereovox.safe_io import check_file
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def add_start(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the trajectory and print where it ends."""
+    from stereovox.evaluate.summary import mostly_lost
     from stereovox.formats.map_server import read_map_server
     from stereovox.localize.robot_track import check_start, fit_of, localise_robot, parse_start, refused_line
 
@@ -58,10 +59,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
     for line in filter(None, (refused_line(track.refused, track.first_refusal), fit_line)):
         say(line)
     x, y, yaw = track.pose_map_base[-1]
-    say(f"{len(track.stamps_ns)} poses saved in {out}")
+    count, lost = len(track.stamps_ns), sum(track.refused.values())
+    doubts = mostly_lost(count, count + lost, "scans", "have poses")
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
-    refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
-    found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))], "fit": fit}
+    refused = {"scans_refused": lost, "refused": dict(track.refused), **({"doubts": doubts} if doubts else {})}
+    say(f"{count} poses saved in {out}{but_few(refused)}")
+    found = {"poses": count, "last": [x, y, float(np.degrees(yaw))], "fit": fit}
     return {**found, **refused, **print_trajectory_error(track, robot)}
 
 

@@ -18,6 +18,7 @@ from stereovox.cli.live_page import page_of, rerun_of
 from stereovox.cli.loops import say_closure
 from stereovox.cli.options import add_checkpoint, add_settings, check_ending, overrides
 from stereovox.cli.terminal import (
+    but_few,
     cells_line,
     command_line,
     first_included,
@@ -175,8 +176,7 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
         say(f"keeps {len(kept)} of its frames, {size(kept.bytes)}: poses can be corrected (remap)")
     if not result["occupied"]:
         say(f"note: {_why_empty(result, config.window)}")
-    few = "".join(f", but {doubt['text']}" for doubt in result.get("doubts", ()) if doubt.get("kind") == "mostly_lost")
-    say(f"saved in {out}{few}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
+    say(f"saved in {out}{but_few(result)}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
 
 
 def _poses_line(mapped: MapResult[VoxelMap]) -> str:

@@ -6,17 +6,20 @@ from __future__ import annotations
 import os
 import shlex
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import cells_line, command_line, say
+from stereovox.cli.terminal import but_few, cells_line, command_line, say
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.safe_io import FLOOR_READABLE, check_in_space
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
     from stereovox.maps.occupancy import OccupancyGrid
+
+Doubts = Sequence[dict[str, Any]]
+"""As `mostly_lost` returns them."""
 
 
 def check_new(out: str, *inputs: str) -> None:
@@ -37,14 +40,14 @@ def name_beside(path: str, what: str) -> str:
     return out
 
 
-def save_new(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
-    """Save a map, print what it contains, and return that with the keys of `info`."""
+def save_new(voxel_map: VoxelMap, out: str, doubts: Doubts = ()) -> dict[str, Any]:
+    """Save a map, print what it contains, and return that with the keys of `info`, and the `doubts` if there are."""
     voxel_map.save(out)
-    return describe_saved(voxel_map, out)
+    return describe_saved(voxel_map, out, doubts)
 
 
-def describe_saved(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
-    """Print what a map contains that was saved to `out`, and return that with the keys of `info`."""
+def describe_saved(voxel_map: VoxelMap, out: str, doubts: Doubts = ()) -> dict[str, Any]:
+    """Print what a map contains that was saved to `out`, and return that with the keys of `info`, and the `doubts`."""
     bounds = voxel_map.bounds()
     result = {
         "out": out,
@@ -53,9 +56,10 @@ def describe_saved(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
         **voxel_map.counts(),
         "memory_bytes": voxel_map.memory_bytes,
         "frames": voxel_map.frames,
+        **({"doubts": list(doubts)} if doubts else {}),
     }
     say(cells_line(result))
-    say(f"saved in {out}; look at it with: {command_line('view', out)}")
+    say(f"saved in {out}{but_few(result)}; look at it with: {command_line('view', out)}")
     return result
 
 

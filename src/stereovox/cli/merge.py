@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.maps import check_new, open_map, save_new
+from stereovox.cli.maps import Doubts, check_new, open_map, save_new
 from stereovox.cli.options import transform_of
 from stereovox.cli.terminal import progress_of_steps, say
 from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_vector
+
+if TYPE_CHECKING:
+    from stereovox.maps import VoxelMap
 
 EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071"
 
@@ -62,7 +65,14 @@ def run(arguments: Namespace) -> dict[str, Any]:
         )
     elif (both := frames_in_both(a, b)) > 0:
         say(f"note: {both} frames are in both maps and count once, from their poses in A")
-    return {**save_new(merged, arguments.out), "exact": why is None}
+    return {**save_new(merged, arguments.out, _doubts(merged)), "exact": why is None}
+
+
+def _doubts(merged: VoxelMap) -> Doubts:
+    """Return whether most of what came for both maps is in none."""
+    from stereovox.evaluate.summary import mostly_lost
+
+    return mostly_lost(merged.frames, merged.frames + merged.frames_refused, "frames of both")
 
 
 def _joined(arguments: Namespace) -> dict[str, Any]:
@@ -79,6 +89,5 @@ def _joined(arguments: Namespace) -> dict[str, Any]:
     turn = np.degrees(np.linalg.norm(rotation_vector(done.T_a_b[:3, :3])))
     say(f"B was found in A at {done.found} places; origin at ({x:.2f}, {y:.2f}, {z:.2f}) m, turned by {turn:.0f} deg")
     say(f"{done.loops} loops closed in and between both")
-    return {
-        **save_new(done.map, arguments.out), "exact": True, "T_a_b": done.T_a_b.round(6).tolist(), "loops": done.loops
-    }  # fmt: skip
+    found = {"exact": True, "T_a_b": done.T_a_b.round(6).tolist(), "loops": done.loops}
+    return {**save_new(done.map, arguments.out, _doubts(done.map)), **found}

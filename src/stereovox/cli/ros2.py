@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.options import add_settings, overrides
-from stereovox.cli.terminal import milliseconds, say, say_about_compiling
+from stereovox.cli.terminal import but_few, milliseconds, say, say_about_compiling
 from stereovox.errors import MapFileError
 from stereovox.safe_io import FLOOR_ENDINGS, check_file, check_in_space
 
@@ -240,7 +240,7 @@ def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
 
 
 def _print_result(map_node: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
-    from stereovox.evaluate.summary import percentiles
+    from stereovox.evaluate.summary import mostly_lost, percentiles
 
     mapped = [one for one in reports if not one.refused]
     result = {
@@ -252,25 +252,28 @@ def _print_result(map_node: MapNode, mapping: Mapping, out: str, reports: deque[
         "frame_ms": percentiles([one.match_ms + one.depth_ms + one.integrate_ms for one in mapped]),
         "out": "",
     }
+    came = result["frames"] + result["frames_refused"] + sum(result["dropped"].values())
+    if doubts := mostly_lost(result["frames"], came, "frames"):
+        result["doubts"] = doubts
     say(f"{result['frames']} frames mapped, {result['frames_refused']} refused, {sum(result['dropped'].values())} late")
     for reason, number in result["refused"].items():
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
     if mapped:
         say(f"a frame: {milliseconds(result['frame_ms'])}")
-    if _save(mapping, out):
+    if _save(mapping, out, but_few(result)):
         result["out"] = out
     elif out:
         say("no frame could be used: no map is written")
     return result
 
 
-def _save(mapping: Mapping, out: str) -> bool:
-    """Save the map if it holds a frame and `out` is given; return whether it was saved."""
+def _save(mapping: Mapping, out: str, few: str = "") -> bool:
+    """Save the map if it holds a frame and `out` is given; return whether it was saved. few: as of `but_few`."""
     if not (out and mapping.history.frames):
         return False
     mapping.save(out)
-    say(f"saved in {out}")
+    say(f"saved in {out}{few}")
     return True
 
 

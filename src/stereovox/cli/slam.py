@@ -13,7 +13,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.robots import add_robot, open_noting, picture_line, print_trajectory_error, settings_of
-from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
+from stereovox.cli.terminal import but_few, progress_of_steps, say, say_about_compiling
 from stereovox.safe_io import FLOOR_ENDINGS, check_file
 
 if TYPE_CHECKING:
@@ -63,21 +63,24 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     result = {**_print_result(robot, found, seconds, compiling), **_score(found, arguments.relations)}
     for line in doubt_lines(found.doubts):
         say(line)
-    say(f"saved in {out}, the trajectory in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
+    files = f"{out}, the trajectory in {out.with_suffix('.tum')}{but_few(result)}"
+    say(f"saved in {files}; look at it with: {picture_line(out)}")
     return result
 
 
 def _print_result(robot: Robot, found: SlamResult, seconds: float, compiling: bool) -> dict[str, Any]:
+    from stereovox.evaluate.summary import mostly_lost
     from stereovox.localize.robot_track import refused_line
 
-    track = found.track
+    track, refused = found.track, sum(found.refused.values())
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
     pace = _pace(recorded, seconds, compiling)
     say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s{pace}")
     if found.refused:
         say(refused_line(found.refused))
-    scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
+    scans = {"scans": len(track.stamps_ns), "scans_refused": refused, "refused": found.refused}
     doubts = [doubt.as_dict() for doubt in found.doubts]
+    doubts += mostly_lost(len(track.stamps_ns), len(track.stamps_ns) + refused, "scans")
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded, "doubts": doubts}
     return {**scans, **times, **print_trajectory_error(track, robot)}
 

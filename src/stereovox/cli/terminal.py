@@ -126,6 +126,12 @@ def milliseconds(figures: dict[str, float]) -> str:
     return "median {median:.2f}, 90 % {p90:.2f}, 99 % {p99:.2f}, longest {max:.2f} ms".format(**figures)
 
 
+def but_few(result: dict[str, Any]) -> str:
+    """Return `, but only ...` for the last line of a command that lost most of what came; else nothing."""
+    lost = [doubt for doubt in result.get("doubts", ()) if isinstance(doubt, dict) and doubt["kind"] == "mostly_lost"]
+    return "".join(f", but {doubt['text']}" for doubt in lost)
+
+
 def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:
     """Print how many `what` (frames) were mapped, which were refused and why, and when they were accepted again."""
     say(f"{result['frames']} {what} mapped, {result['frames_refused']} refused")

@@ -41,14 +41,15 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
     }
 
 
-def mostly_lost(frames: int, offered: int, what: str) -> list[dict[str, Any]]:
+def mostly_lost(frames: int, offered: int, what: str, became: str = "are in the map") -> list[dict[str, Any]]:
     """Return the doubt of a map that holds less than half of what came, for the summary; else nothing.
 
-    frames: of `offered` ones of this run that are in the map. what: what they are called (images).
+    frames: of `offered` ones of this run that are in the map. what: what they are called (images). became: what those
+    are that are not lost.
     """
     if 2 * frames >= offered:
         return []
-    text = f"only {frames} of {offered} {what} are in the map"
+    text = f"only {frames} of {offered} {what} {became}"
     return [{"kind": "mostly_lost", "frames": frames, "offered": offered, "text": text}]
 
 

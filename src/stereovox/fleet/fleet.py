@@ -14,6 +14,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
+from stereovox.evaluate.summary import mostly_lost
 from stereovox.fleet.boxes import DONE, Box, BoxesBefore, DoneBox, boxes_of, map_box
 from stereovox.fleet.cluster import Cluster, cluster
 from stereovox.fleet.recordings import (
@@ -87,7 +88,8 @@ class FleetMap:
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox fleet --json`, besides those of the map."""
-        broken = [f"{one.recording}: {one.error}" for one in self.recordings if one.error]
+        broken: list[Any] = [f"{one.recording}: {one.error}" for one in self.recordings if one.error]
+        broken += mostly_lost(self.map.frames, self.map.frames + self.map.frames_refused, "frames")
         return {
             "recordings": [one.summary() for one in self.recordings],
             "boxes": self.boxes[0],

@@ -2,6 +2,7 @@
 """The rolling window against a dictionary of cells that does the same slowly."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -228,6 +229,28 @@ def test_most_touched_is_the_most():
     for n in (1, 2, 7, 8, 9, 16, 17, 100):
         seen = max((start + n - 1) // 8 - start // 8 + 1 for start in range(8))
         assert most_touched((n, 1, 1), 8) == seen
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("damage", [cut, flip, Path.unlink])
+def test_tiles_that_are_not_what_was_written_are_not_believed(damage, tmp_path):
+    store = TileStore(make_map(settings()).storage.cell_format, tmp_path / "tiles")
+    cells = np.random.default_rng(6).integers(-2000, 3500, (1, 512)).astype(np.int16)
+    store.put((0, 0, 0), np.zeros((1, 3), np.int32), cells)
+    store._settle((0, 0, 0))
+    damage(next(path for path in (tmp_path / "tiles").rglob("c/*/*/*")))
+    for ask in (store.get, lambda tile: store.stored_at(tile, np.zeros((1, 3), np.int64))):
+        with pytest.raises(MapFileError, match=r"tiles: tile .*damaged"):
+            ask((0, 0, 0))
 
 
 def test_tiles_come_back_as_they_went(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ doubted (its `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import signal
@@ -64,6 +65,7 @@ The module of a command that is a Python keyword has a trailing underscore.
 
 DOUBTED = 3
 """Exit status of a command that wrote a map which may be wrong, or a trajectory with gaps."""
+UNUSABLE = "check that it exists and that you may use it"
 GLOBAL_OPTIONS = ("-h", "--help", "--version")
 """Options that may stand before a command or without one."""
 
@@ -81,7 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(" ".join(str(error).split()), 2, words)
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk
         where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2, words)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        cure = "what was being written is not complete; remove it, and make room" if full else UNUSABLE
+        return _fail(f"{where}{error.strerror or error}; {cure}", 2, words)
     except MemoryError:
         return _fail("not enough memory; use larger cells (--voxel-size) or a shorter --max-range", 2)
     except KeyboardInterrupt as stopped:

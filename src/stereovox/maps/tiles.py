@@ -10,6 +10,7 @@ import re
 import shutil
 import tempfile
 import weakref
+import zlib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, one_line
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellFormat
 from stereovox.maps.lock import LOCK, only_store_in
@@ -32,6 +33,8 @@ OFFSET = 1 << 30
 """Cell 0 stands here in the array: Zarr knows no negative indices."""
 WAITING = 128
 """Tiles that may wait to be written; one more and mapping waits."""
+
+DAMAGED = "the map of this run is damaged, make it again on a disk that works"
 
 INNER = "times"
 """Folder for another store of the same tiles; whoever removes this one's folder removes it as well."""
@@ -53,7 +56,7 @@ class TileStore:
         self.folder = Path(tempfile.mkdtemp(prefix="stereovox-tiles-")) if folder is None else folder
         self._writing = ExitStack()
         self._array = self._create()
-        self._tiles: set[Tile] = set()
+        self._tiles: dict[Tile, int] = {}  # with the checksum of what each holds
         self._waiting: dict[Tile, tuple[NDArray, Future[None]]] = {}
         self._failed: OSError | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="stereovox-tiles")
@@ -76,7 +79,7 @@ class TileStore:
             self._settle(next(iter(self._waiting)))
         dense = np.full((BLOCKS,) * 3 + (CELLS,), self._format.unknown, self._format.dtype)
         dense[tuple((coords - np.multiply(tile, BLOCKS)).T)] = cells
-        self._tiles.add(tile)
+        self._tiles[tile] = zlib.crc32(dense)
         self._waiting[tile] = dense, self._writer.submit(self._write, tile, dense)
         self._forget_written()
 
@@ -159,7 +162,15 @@ class TileStore:
         self._array[_place(tile)] = _to_cells(dense)
 
     def _read(self, tile: Tile) -> NDArray:
-        return _to_blocks(np.asarray(self._array[_place(tile)]))
+        """Return what was written. Raises MapFileError where the disk does not hold it any more."""
+        try:
+            dense = _to_blocks(np.asarray(self._array[_place(tile)]))
+        except (OSError, ValueError, RuntimeError) as error:
+            why = getattr(error, "strerror", None) or one_line(str(error))
+            raise MapFileError(f"{self.folder}: tile {tile} cannot be read ({why}); {DAMAGED}") from None
+        if tile in self._tiles and zlib.crc32(dense) != self._tiles[tile]:
+            raise MapFileError(f"{self.folder}: tile {tile} is not what was written there; {DAMAGED}")
+        return dense
 
     def _settle(self, tile: Tile) -> None:
         try:

@@ -152,8 +152,14 @@ def test_an_image_whose_pose_does_not_come_is_refused_with_the_reason(tmp_path):
 def test_images_before_the_first_pose_wait_and_are_counted(tmp_path):
     poses, keeper = LivePoses(), Keeper()
     images = Images(count=30)
-    timer = threading.Timer(0.3, lambda: sender.__enter__())
     sender = Sender(poses.add)
+
+    def begin():
+        while len(images.stamps) < 5:
+            sleep(0.01)
+        sender.__enter__()
+
+    timer = threading.Thread(target=begin)
     timer.start()
     try:
         done = map_live(images, tmp_path / "a.svox", poses=poses, wait_s=0.05, observers=[keeper], **SMALL)

@@ -79,7 +79,7 @@ class TileStore:
             self._settle(next(iter(self._waiting)))
         dense = np.full((BLOCKS,) * 3 + (CELLS,), self._format.unknown, self._format.dtype)
         dense[tuple((coords - np.multiply(tile, BLOCKS)).T)] = cells
-        self._tiles[tile] = zlib.crc32(dense)
+        self._tiles[tile] = zlib.crc32(dense.data)
         self._waiting[tile] = dense, self._writer.submit(self._write, tile, dense)
         self._forget_written()
 
@@ -168,7 +168,7 @@ class TileStore:
         except (OSError, ValueError, RuntimeError) as error:
             why = getattr(error, "strerror", None) or one_line(str(error))
             raise MapFileError(f"{self.folder}: tile {tile} cannot be read ({why}); {DAMAGED}") from None
-        if tile in self._tiles and zlib.crc32(dense) != self._tiles[tile]:
+        if tile in self._tiles and zlib.crc32(dense.data) != self._tiles[tile]:
             raise MapFileError(f"{self.folder}: tile {tile} is not what was written there; {DAMAGED}")
         return dense
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels on one depth image: metres and reasons, corrections, denoising, block minima, shorter range, quality."""
+"""Kernels on one depth image: metres and reasons, corrections, block minima, shorter range, quality."""
 
 import numpy as np
 
@@ -11,12 +11,6 @@ NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 CHUNK = 4096
 """Pixels that stay in the fastest cache between two passes."""
-SEGMENT = 32
-"""Pixels of a row that are skipped together where none of them is noisy."""
-NONE = np.float32(-1e6)
-"""Inverse depth of a pixel without value: far from every other."""
-COARSEST = np.float32(1e4)
-"""Bound for the noise of inverse depth, so that NONE stays far from everything."""
 
 
 @kernel
@@ -123,106 +117,6 @@ def thesis(p, x, depth_m):
             d = z - (across * (p[0] * across + p[1]) + p[2])
             d = d if d > ZERO else NAN
             row[u] = z if abs(z) == FAR else d
-
-
-@kernel
-def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings):
-    """Replace every depth by a weighted mean over neighbours, in place; pixels without value stay as they are.
-
-    depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. One pass after another:
-    steps: (passes,) int64, distance of its four neighbours in pixels; fine: noise in metres up to which it leaves a
-    pixel unchanged; widths: difference in sigma at which a neighbour no longer counts; limit: cap of sigma, metres.
-    low, high: results are kept within these depths. rings: scratch (passes + 1, 2 m + 1, w + 2 m), m the largest
-    step and w rounded up to SEGMENT: inverse depths of the rows that are needed, measured and after each pass.
-    """
-    height, passes, rows = depth_m.shape[0], steps.size, rings.shape[1]
-    margin = rows // 2
-    rings[:, :, :] = NONE
-    for v in range(height + passes * margin):
-        if v < height:
-            _invert(depth_m[v], rings[0, v % rows], margin)
-        else:
-            rings[0, v % rows, :] = NONE
-        for i in range(passes):
-            middle = v - (i + 1) * margin
-            if 0 <= middle < height:
-                ring, step = rings[i], steps[i]
-                _average(
-                    ring[(middle - step) % rows], ring[middle % rows], ring[(middle + step) % rows], np.uintp(step),
-                    np.uintp(margin), noise, fine[i], widths[i], limit, rings[i + 1, middle % rows],
-                )  # fmt: skip
-            elif middle >= height:
-                rings[i + 1, middle % rows, :] = NONE
-        last = v - passes * margin
-        if last >= 0:
-            _write(rings[passes, last % rows], np.uintp(margin), noise, fine[0], low, high, depth_m[last])
-
-
-@cell
-def _invert(depths, inverse, margin):
-    for u in range(np.uintp(depths.size)):  # unsigned, here and below: else each index is first compared with 0
-        d = depths[u]
-        inverse[u + np.uintp(margin)] = ONE / d if (d > ZERO) & (d < FAR) else NONE
-
-
-@cell
-def _write(inverse, margin, noise, fine, low, high, depths):
-    """Write depths where they were to change."""
-    for u in range(np.uintp(depths.size)):
-        d = depths[u]
-        counts = (noise[0] + d * (noise[1] + d * noise[2]) > fine) & (d > ZERO) & (d < FAR)
-        depths[u] = min(max(ONE / inverse[u + margin], low), high) if counts else d
-
-
-@cell
-def _average(above, row, below, step, margin, noise, fine, wide, limit, out):
-    """Average the pixels of a row with those `step` beside them, and in the rows above and below; margins stay."""
-    for start in range(margin, np.uintp(row.size) - margin, np.uintp(SEGMENT)):
-        if _any_noisy(row, start, noise, fine):
-            for i in range(np.uintp(SEGMENT)):
-                u = start + i
-                c = row[u]
-                sigma, square = _sigma(c, noise), c * c
-                reach = wide * min(sigma, limit * square)
-                total, weight = _four(c, row[u - step], row[u + step], above[u], below[u], ONE / (reach * reach))
-                out[u] = c + total / (ONE + weight) if (sigma > fine * square) & (c > ZERO) else c
-        else:
-            for i in range(np.uintp(SEGMENT)):
-                out[start + i] = row[start + i]
-
-
-@cell
-def _any_noisy(inverse, start, noise, fine):
-    """Return whether any pixel of a segment has more noise than `fine`."""
-    number = np.int32(0)
-    for i in range(np.uintp(SEGMENT)):
-        c = inverse[start + i]
-        number += np.int32((_sigma(c, noise) > fine * c * c) & (c > ZERO))
-    return number > 0
-
-
-@cell
-def _sigma(c, noise):
-    """Return the noise of inverse depth c: sigma(z) / z^2."""
-    return min(noise[2] + c * (noise[1] + c * noise[0]), COARSEST)
-
-
-@cell
-def _four(c, p, q, r, s, scale):
-    """Return the weighted sum of four neighbours' differences from `c`, and the sum of their weights.
-
-    A weight is (1 - difference^2 scale)^4, at least 0: a neighbour at half the largest difference counts a third.
-    """
-    p, q, r, s = p - c, q - c, r - c, s - c
-    f, g, h, k = _weight(p * p * scale), _weight(q * q * scale), _weight(r * r * scale), _weight(s * s * scale)
-    return (f * p + g * q) + (h * r + k * s), (f + g) + (h + k)
-
-
-@cell
-def _weight(square):
-    w = max(ONE - square, ZERO)
-    w = w * w
-    return w * w
 
 
 @kernel

@@ -8,7 +8,7 @@ import sys
 from time import perf_counter
 
 import stereovox as sv
-from stereovox.lab.checks.agreement import agreement
+from stereovox_lab.checks.agreement import agreement
 
 
 def main(recording: str, frames: str = "::1", sensor: str = "stereo") -> None:

@@ -20,9 +20,9 @@ from time import thread_time
 
 import numpy as np
 
-from stereovox import se2
 from stereovox.config import Config, load_config
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import Localiser
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.simulate.floors.floor import Floor

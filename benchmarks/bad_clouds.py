@@ -25,7 +25,7 @@ from stereovox.depth.cloud import checked_cloud
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.simulate.floors.floor import Floor
 from stereovox.sources.robots.carmen import CarmenLog
 

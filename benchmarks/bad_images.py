@@ -10,7 +10,7 @@ the map as it is then, and taken back. One that is not refused is harmless where
 of the sure cells it says something of, and frees no occupied one; what the true frame would do as well does not count.
 
 With --last, frames are bad for so many seconds, or the world is another one from a moment on: how much of it does the
-map believe, and when? Each seed is a hall at random (`stereovox.lab.checks.lasting`).
+map believe, and when? Each seed is a hall at random (`stereovox_lab.checks.lasting`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from dataclasses import asdict
 
 import stereovox as sv
 from stereovox.cli.options import add_settings, overrides
-from stereovox.lab.checks.bad_images import trial
-from stereovox.lab.checks.lasting import CHANGES, FAULTS, Trial
+from stereovox_lab.checks.bad_images import trial
+from stereovox_lab.checks.lasting import CHANGES, FAULTS, Trial
 
 
 def main() -> None:

@@ -25,11 +25,11 @@ from time import perf_counter
 import numpy as np
 
 import stereovox as sv
-from stereovox.maps.blocks import CELLS
-from stereovox.maps.boxed_manifest import BoxedManifest, write_boxed_manifest
-from stereovox.maps.boxes import BoxBlocks, BoxLayout, write_blocks
-from stereovox.maps.pyramid import write_levels
-from stereovox.places import Place
+from stereovox.files.places import Place
+from stereovox.maps.cells.pyramid import write_levels
+from stereovox.maps.files.boxed_manifest import BoxedManifest, write_boxed_manifest
+from stereovox.maps.storage.blocks import CELLS
+from stereovox.maps.storage.boxes import BoxBlocks, BoxLayout, write_blocks
 
 SIDE = 256
 NOISY = 0.1

@@ -15,10 +15,10 @@ import made_pairs as made
 
 from stereovox.calibrate.pair import calibrate_pair
 from stereovox.frame import Frame
-from stereovox.se3 import inverse, rotation_vector
+from stereovox.geometry.se3 import inverse, rotation_vector
 from stereovox.simulate.d435 import depth_camera
 from stereovox.sources.base import Source
-from stereovox.sources.tracker import on_clock
+from stereovox.sources.poses.tracker import on_clock
 
 HZ, WIDTH = 15, 212
 

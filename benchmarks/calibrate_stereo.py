@@ -27,7 +27,7 @@ from stereovox.calibrate.stereo_fit import FULL_MODEL_VIEWS, GUESSES, Corners, F
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 BOARD = Board(9, 6, 0.03)
 SIZE = (640, 480)

@@ -27,7 +27,7 @@ import stereovox as sv
 from stereovox.config import load_config
 from stereovox.depth.pipeline import DepthPipeline
 from stereovox.frame import Frame, Reason, StereoFrame
-from stereovox.se3 import inverse, transform_points
+from stereovox.geometry.se3 import inverse, transform_points
 
 SIDE = 24
 """Pixels across a square."""

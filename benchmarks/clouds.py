@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from stereovox.config import load_config, parse_value
 from stereovox.errors import StereovoxError
 from stereovox.frame import Cloud
-from stereovox.lab.bench.native import WavemapCpp
-from stereovox.lab.bench.peers import UNKNOWN, find_peer
 from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.opening import open_source
+from stereovox_lab.bench.native import WavemapCpp
+from stereovox_lab.bench.peers import UNKNOWN, find_peer
 
 ALONG = 8
 """Places on each held-out ray."""

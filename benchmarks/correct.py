@@ -21,7 +21,7 @@ import numpy as np
 
 import stereovox as sv
 from stereovox.config import parse_value
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 
 TRUSTING = {"trust.max_disagreement": 1, "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9, "trust.frozen": False}
 """A new run must not refuse what the corrected map holds."""

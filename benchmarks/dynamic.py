@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.lab.checks.ghosts import Ghosts, ghosts
-from stereovox.simulate.passer_by import BACKGROUNDS, HZ, MISSES, PasserBy
+from stereovox_lab.checks.ghosts import Ghosts, ghosts
+from stereovox_lab.checks.passer_by import BACKGROUNDS, HZ, MISSES, PasserBy
 
 MODELS: dict[str, dict[str, Any]] = {
     "default": {},

@@ -27,10 +27,10 @@ import psutil
 
 import stereovox as sv
 from stereovox.config import load_config, parse_value
-from stereovox.deadline import Levels
+from stereovox.files.places import Place
 from stereovox.fleet import map_fleet, recordings_of
 from stereovox.fleet.recordings import frames_of
-from stereovox.places import Place
+from stereovox.mapping.deadline import Levels
 
 
 def main() -> None:

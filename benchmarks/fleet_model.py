@@ -23,10 +23,10 @@ from typing import NamedTuple
 from distributed import Client, LocalCluster
 
 import stereovox as sv
+from stereovox.files.places import Place
 from stereovox.fleet import map_fleet
 from stereovox.fleet.boxes import Box, boxes_of
 from stereovox.fleet.recordings import boxes_seen
-from stereovox.places import Place
 
 WORKERS = 1, 10, 100, 300, 1000
 

@@ -5,7 +5,7 @@
 
 Each seed is another hall, start, way of the sticks and noise. A depth camera (15 Hz, a D435's field of view, 212 pixels
 wide) sees ahead; after one turn on the spot the sticks ask for up to 1.5 m/s in any direction for 40 s. The 72 sectors
-of the growing map go to PX4's collision prevention as its documents describe it (`stereovox.lab.flights.px4`) ten times
+of the growing map go to PX4's collision prevention as its documents describe it (`stereovox_lab.flights.px4`) ten times
 a second. Told are collisions (a ball of 25 cm touches a surface), how far it flew, and the least room. `--without`
 flies the same seeds as the sticks say. `--set` changes the `Setup` (`speed=3`, `pose_sigma=[0.02,0.01]`), its rules
 (`rules.half_height=0.2`), the autopilot's parameters (`parameters.cp_dist=0.8`), the airframe (`airframe.radius=0.4`).
@@ -28,7 +28,7 @@ import numpy as np
 
 from stereovox.config import parse_value
 from stereovox.errors import StereovoxError
-from stereovox.lab.flights.flight import Flight, Setup, fly
+from stereovox_lab.flights.flight import Flight, Setup, fly
 
 
 def main() -> None:

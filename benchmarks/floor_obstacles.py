@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stereovox as sv
+from stereovox.geometry.se3 import look_at
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.projection import project
-from stereovox.se3 import look_at
+from stereovox.products.floor.projection import project
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.scene import Scene, Solid, box, cylinder

@@ -18,7 +18,7 @@ import numpy as np
 from numba import cuda
 
 import stereovox as sv
-from stereovox.maps.cell_format import CellRules
+from stereovox.maps.cells.cell_format import CellRules
 from stereovox.products.side_by_side import side_by_side
 
 FIRST = 10

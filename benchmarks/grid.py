@@ -17,8 +17,9 @@ from time import perf_counter
 
 import numpy as np
 
-from stereovox import Scan, se2
+from stereovox import Scan
 from stereovox.formats.map_server import read_map_server, write_map_server
+from stereovox.geometry import se2
 from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import open_source
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
+from stereovox.runs.survey import survey
 from stereovox.simulate.simulation import Simulation
-from stereovox.survey import survey
 
 SCENES = ("room", "apartment", "aisle?speed=1", "flight?length=60", "box?size=large")
 UNITS = (0.001, 0.001, 1 / 5000, 1 / 5000, 1 / 4000, 1 / 6553.5, 1 / 10000, 0.01, 1 / 256, 1.0)

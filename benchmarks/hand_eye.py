@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.calibrate.pair import hand_eye
-from stereovox.se3 import inverse, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import inverse, rotation_matrix, rotation_vector
 
 METHODS = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 IMAGES = 60

@@ -27,16 +27,16 @@ from typing import Any
 import psutil
 
 from stereovox.config import load_config
-from stereovox.evaluate.grid_scores import score_grids
-from stereovox.floor_run import map_floor
+from stereovox.evaluate.grids.grid_scores import score_grids
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.localize.robot_track import slam_robot
 from stereovox.opening import open_robot
+from stereovox.runs.floor import map_floor
 from stereovox.simulate.floors.bag import write_bag
 from stereovox.simulate.floors.floor import Floor
 
 ROOT = Path(__file__).resolve().parent.parent
-PLAYER = ROOT / "tests/ros/play.py"
+PLAYER = ROOT / "tests/helpers/play.py"
 DEPTH, SCAN = "/camera/depth/image_raw", "/scan"
 TARGET = 1.0
 """Points of Eq 7."""

@@ -29,11 +29,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from stereovox import run
 from stereovox.cli import main
 from stereovox.mapper import Mapper
 from stereovox.maps import load_map, make_map
 from stereovox.opening import open_stream
+from stereovox.runs import recording as run
 
 CONTEXT = get_context("fork")
 PLAIN: list[str] = []

@@ -20,7 +20,7 @@ from collections import Counter
 from dataclasses import replace
 from time import process_time
 
-from stereovox.lab.flights.late import LateFlight, fly_late, setup_of
+from stereovox_lab.flights.late import LateFlight, fly_late, setup_of
 
 
 def main() -> None:

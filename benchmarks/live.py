@@ -40,10 +40,10 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import UpdateReport
+from stereovox.geometry.se3 import Transform, inverse, rotation_vector
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun
-from stereovox.maps.storage import EVERYWHERE
-from stereovox.se3 import Transform, inverse, rotation_vector
+from stereovox.maps.storage.storage import EVERYWHERE
 from stereovox.simulate.rendering import photograph
 from stereovox.simulate.simulation import GREY_NOISE, Simulation
 from stereovox.sources.base import Stream

@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 
 import stereovox as sv
 from stereovox.config import load_config, parse_value
-from stereovox.evaluate.trajectory_score import score_trajectory
-from stereovox.loops.closer import Loop, LoopCloser
-from stereovox.loops.drift import difference
-from stereovox.maps.kept_frames import KeptFrame
-from stereovox.se3 import inverse
+from stereovox.correct.loops.closer import Loop, LoopCloser
+from stereovox.correct.loops.drift import difference
+from stereovox.evaluate.trajectory.trajectory_score import score_trajectory
+from stereovox.geometry.se3 import inverse
+from stereovox.maps.record.kept_frames import KeptFrame
 from stereovox.simulate.simulation import Simulation
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 SCENES = {
     "offices": "sim:offices?walk={seed}&",

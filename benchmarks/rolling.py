@@ -21,7 +21,7 @@ from stereovox import Mapper, PinholeCamera, VoxelMap, open_source
 from stereovox.config import load_config
 from stereovox.frame import Viewpoint
 from stereovox.maps import make_map
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
 
 CHIEN = {"voxel_size": 0.2, "window.size": [20.0, 6.0, 20.0]}
 FLIGHT = {"voxel_size": 0.2, "max_range": 5.0, "window.size": [20.0, 20.0, 16.0]}

@@ -34,7 +34,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 import stereovox as sv
 from stereovox.ros.outputs import header
-from stereovox.ros.tf_message import packed_transforms, tf_message
+from stereovox.ros.poses.tf_message import packed_transforms, tf_message
 from stereovox.sources.bags.messages import Wire
 
 KEPT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stereovox import State, export, import_map, load_map
-from stereovox.maps.cubes import in_cubes
+from stereovox.maps.storage.cubes import in_cubes
 
 ENDINGS = (".bt", ".ot", ".npz", ".ply", ".pcd", ".bag", ".mcap")
 

@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from stereovox import se2
 from stereovox.config import load_config, parse_value
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.slam.pipeline import map_scans
 from stereovox.opening import parse_slice
 from stereovox.simulate.floors.drive import STEP_NS, Odometry, Stop, drive

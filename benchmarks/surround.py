@@ -14,10 +14,10 @@ from stereovox.depth import prepare
 from stereovox.depth.sphere import SphereGrid, accumulate, stitch
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.frame import Frame, Reason
-from stereovox.lab.checks.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
 from stereovox.sensors.noise import SUBPIXEL
 from stereovox.simulate.surround import Surround
+from stereovox_lab.checks.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
 
 STATISTICS = {"minimum": {"sphere.statistic": "minimum"}, "mean - 3 std": {}, "mean - 2 std": {"sphere.spread": 2.0}}
 

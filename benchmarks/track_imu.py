@@ -20,10 +20,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory_motions import angles_deg
+from stereovox.evaluate.trajectory.trajectory_motions import angles_deg
 from stereovox.frame import AnyFrame, Frame
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
 from stereovox.sources.imu import Imu, ImuReadings
 from stereovox.track.tracker import Tracker
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 import stereovox as sv
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.se3 import Transform, inverse, look_at
+from stereovox.geometry.se3 import Transform, inverse, look_at
 from stereovox.simulate.d435 import D435, HFOV_DEG
 from stereovox.simulate.rendering import photograph
 from stereovox.simulate.scene import Scene, Solid, box

@@ -18,8 +18,9 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ByteSize
 from pydantic.fields import FieldInfo
 
-from stereovox import Config, cli, entrance, load_config, registry
+from stereovox import Config, cli, load_config, registry
 from stereovox.config import profile_names
+from stereovox.mapping import entrance
 from stereovox.products import context
 from stereovox.sensors import SENSORS
 
@@ -75,7 +76,7 @@ change a map. A cell is the function that refuses, or why there is nothing to ch
 ROS 2 and fleets enter through these two, so the checks are the same. A refused input changes nothing but the count of
 refusals.
 [What a map promises](../safety.md#which-frames-may-change-the-map) explains the checks of time, pose and content. In
-Python: `stereovox.entrance.CHECKS`.
+Python: `stereovox.mapping.entrance.CHECKS`.
 
 {table}
 
@@ -119,7 +120,7 @@ def pages() -> dict[str, str]:
 
 def _refusals() -> str:
     others = [f"| `{reason}` | {when} |" for reason, when in entrance.ELSEWHERE.items()]
-    source = SOURCE.format("stereovox.entrance")
+    source = SOURCE.format("stereovox.mapping.entrance")
     return REFUSALS.format(source=source, table="\n".join(entrance.table()), others="\n".join(others))
 
 

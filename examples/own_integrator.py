@@ -4,9 +4,9 @@
 import numpy as np
 
 import stereovox as sv
+from stereovox.geometry.se3 import transform_points
 from stereovox.integrate import INTEGRATORS
-from stereovox.maps.evidence import Evidence
-from stereovox.se3 import transform_points
+from stereovox.maps.cells.evidence import Evidence
 
 
 class HitsOnly:

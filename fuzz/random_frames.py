@@ -12,7 +12,7 @@ import stereovox as sv
 from random_cameras import RandomCameras
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.frame import AnyFrame, Scan, StereoFrame
-from stereovox.se3 import from_quaternion, inverse
+from stereovox.geometry.se3 import from_quaternion, inverse
 
 STRANGE = (0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 1e-45, 3e38, 65535.0, 65536.0, 0.05, 2.0)
 """Numbers that are not what a sensor says, or just are."""

@@ -34,7 +34,8 @@ from mutate import with_right_sums
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.inputs import read_camera_path
-from stereovox.evaluate.trajectory import read_relations
+from stereovox.evaluate.trajectory.trajectory import read_relations
+from stereovox.files.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map
 from stereovox.formats.clouds import read_cloud_map
@@ -46,21 +47,20 @@ from stereovox.maps import VoxelMap, load_map, save_boxed
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_source
-from stereovox.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.sources import images
-from stereovox.sources.calibration_files import import_rig
-from stereovox.sources.camera_file import find_camera, read_camera
+from stereovox.sources.calibration.calibration_files import import_rig
+from stereovox.sources.calibration.camera_file import find_camera, read_camera
 from stereovox.sources.kitti.calibration import read_calibration, read_raw_calibration
 from stereovox.sources.kitti.poses import read_oxts_file, read_pose_file
 from stereovox.sources.kitti.tracking import read_labels
 from stereovox.sources.lidar import read_velodyne
-from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
+from stereovox.sources.poses.tracker import read_tracker
 from stereovox.sources.rgbd.depth_files import read_depth
 from stereovox.sources.rgbd.pose_files import read_poses
-from stereovox.sources.rig_file import read_rig
+from stereovox.sources.rigs.pair_file import PairSettings, pair_text, read_pair
+from stereovox.sources.rigs.rig_file import read_rig
 from stereovox.sources.robots.bag import RobotBag
 from stereovox.sources.robots.carmen import CarmenLog
-from stereovox.sources.tracker import read_tracker
 
 MAX_FRAMES = 20
 SIZE = (16, 12)

@@ -4,10 +4,9 @@
 import signal
 
 import pytest
+from made_bucket import s3, where  # noqa: F401 - fixtures
 from made_domains import domains  # noqa: F401 - a fixture
 from xdist.scheduler import WorkStealingScheduling
-
-from made_bucket import s3, where  # noqa: F401 - fixtures
 
 
 def pytest_xdist_make_scheduler(config, log):

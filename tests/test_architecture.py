@@ -12,7 +12,7 @@ import pytest
 
 import stereovox
 from stereovox.mapper import GridMapper, Mapper
-from stereovox.run import Checkpoints
+from stereovox.runs.recording import Checkpoints
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
@@ -187,11 +187,11 @@ def test_the_drawing_in_contributing_is_this_house():
         ("maps/a.py", "from stereovox.view.picture import picture", "maps must not import view"),
         (
             "maps/_a.py",
-            "from stereovox.maps.cell_format import State",
+            "from stereovox.maps.cells.cell_format import State",
             "machine code outlives a change of maps.cell_format.State: only kernel files are hashed",
         ),
         ("maps/a.py", "from stereovox import geometry, mapper", "maps must not import mapper"),
-        ("maps/a.py", "def f():\n    import stereovox.cli.map", "maps must not import cli"),
+        ("maps/a.py", "def f():\n    import stereovox.cli.map.map", "maps must not import cli"),
         ("maps/a.py", "if TYPE_CHECKING:\n    from ..integrate import ray", "maps must not import integrate"),
         ("maps/a.py", 'MAPS = {"ray": "stereovox.integrate.ray:Ray"}', "maps must not import integrate"),
         ("maps/__init__.py", "from .. import mapper", "maps must not import mapper"),
@@ -226,7 +226,7 @@ def test_bare_files_are_found(tmp_path):
 
 def test_nothing_goes_by_a_clock_that_is_set():
     """Checkpoints, ages and deadlines would come early, late or never when somebody sets the system's time."""
-    measured = SOURCE / "trust/wall_clock.py"  # ages of images by their own stamps
+    measured = SOURCE / "frame/wall_clock.py"  # ages of images by their own stamps
     for path in sorted({*SOURCE.rglob("*.py")} - {measured}):
         names = {name for _, name in imported(ast.parse(path.read_text()), [])}
         assert not names & {"time", "time.time", "time.time_ns", "datetime", "datetime.datetime"}, path

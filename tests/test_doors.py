@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 import wire
+from entrance_cases import SETTINGS, good
+from made_doors import FAULTS, GOOD, bad_depth, bad_points, write_faulty
 
 import stereovox as sv
-from entrance_cases import SETTINGS, good
 from frames import digest
-from made_doors import FAULTS, GOOD, bad_depth, bad_points, write_faulty
-from stereovox.entrance import CLOUD, IMAGE
 from stereovox.fleet import map_fleet
 from stereovox.live.run import LiveRun
+from stereovox.mapping.entrance import CLOUD, IMAGE
 from stereovox.sources.base import Stream
 
 START_NS, FRAME_NS = 1_700_000_000_000_000_000, 100_000_000

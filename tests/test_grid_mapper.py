@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stereovox as sv
-from stereovox import se2
 from stereovox.errors import ConfigError
+from stereovox.geometry import se2
+from stereovox.geometry.se3 import from_quaternion
 from stereovox.mapper import GridMapper
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.se3 import from_quaternion
 
 ROOM = 2.0
 STRANGE = [0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 0.05, 7.0]

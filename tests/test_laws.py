@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import stereovox as sv
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.frame import Reason
-from stereovox.se3 import from_quaternion
+from stereovox.geometry.se3 import from_quaternion
 
 SIZE, REACH = 0.25, 4.0
 SLACK = 1.5 * SIZE

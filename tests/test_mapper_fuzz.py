@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stereovox as sv
-from stereovox.se3 import from_quaternion
+from stereovox.geometry.se3 import from_quaternion
 
 STRANGE = [0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 65535.0, 0.05, 2.0]
 

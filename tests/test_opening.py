@@ -12,8 +12,8 @@ from stereovox.opening import SOURCES, open_images, open_source
 from stereovox.registry import find
 from stereovox.simulate.recorder import record
 from stereovox.simulate.simulation import Simulation
-from stereovox.sources.rgbd.seven_scenes import SevenScenes
-from stereovox.sources.rgbd.tum import TumRgbd
+from stereovox.sources.rgbd.layouts.seven_scenes import SevenScenes
+from stereovox.sources.rgbd.layouts.tum import TumRgbd
 
 POSES = "1 0 0 0 0 0 0 1\n"
 

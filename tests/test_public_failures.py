@@ -16,8 +16,8 @@ from stereovox.cli import main
 from stereovox.errors import MapFileError
 from stereovox.formats import export, read_octomap
 from stereovox.formats.map_server import read_map_server
+from stereovox.geometry.se3 import look_at
 from stereovox.maps import State
-from stereovox.se3 import look_at
 
 CAMERA = sv.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)
 FORWARD = look_at([0.03, 0.02, 0.51], [1.03, 0.02, 0.51])

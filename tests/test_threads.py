@@ -18,27 +18,19 @@ import stereovox as sv
 from stereovox.errors import StereovoxError
 from stereovox.formats import bags, meshes, octomap, points, rerun
 from stereovox.frame import Viewpoint
+from stereovox.kernels.threads import MapLock, one_state
 from stereovox.mapper import GridMapper
-from stereovox.maps import cell_pool, cubes, make_map
-from stereovox.maps.evidence import Evidence, GridEvidence
+from stereovox.maps import make_map
+from stereovox.maps.cells import cell_pool
+from stereovox.maps.cells.evidence import Evidence, GridEvidence
 from stereovox.maps.occupancy import Percent
-from stereovox.maps.storage import OnStorage, Storage
+from stereovox.maps.record.history import WithHistory
+from stereovox.maps.storage import cubes
+from stereovox.maps.storage.storage import OnStorage, Storage
 from stereovox.maps.voxel_map import OnBlocks
-from stereovox.products import (
-    coarsen,
-    crop,
-    difference,
-    frontiers,
-    ground,
-    merge,
-    moved,
-    path_check,
-    projection,
-    slices,
-)
-from stereovox.products.live_projection import LiveProjection
-from stereovox.threads import MapLock, one_state
-from stereovox.trust.history import WithHistory
+from stereovox.products import coarsen, crop, difference, frontiers, merge, moved, path_check
+from stereovox.products.floor import ground, projection, slices
+from stereovox.products.floor.live_projection import LiveProjection
 
 NO_EVIDENCE = Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.empty((0, 3), np.int32), 0)
 NO_SCAN = GridEvidence(np.empty((0, 3), np.int32), np.empty((0, 4096), np.int16))
@@ -87,7 +79,7 @@ def taken(lock):
 
 def test_threads_that_add_ask_and_save_meet_the_map_between_two_frames():
     """Crashes and endless waits are failures, too: all happens in a process of its own."""
-    script = Path(__file__).with_name("maps") / "made_threads.py"
+    script = Path(__file__).with_name("helpers") / "made_threads.py"
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 

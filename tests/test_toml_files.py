@@ -8,9 +8,9 @@ import tomllib
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import is_number, toml_text
-from stereovox.sources.camera_file import read_camera
-from stereovox.sources.pair_file import read_pair
+from stereovox.files.safe_io import is_number, toml_text
+from stereovox.sources.calibration.camera_file import read_camera
+from stereovox.sources.rigs.pair_file import read_pair
 
 HUGE = "9" * 400
 CAMERA = "width=8\nheight=6\nfy=9\ncx=4\ncy=3\n"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What `stereovox bench` calls in the library of a peer; src/stereovox/lab/bench/native.py is the other side.
+// What `stereovox bench` calls in the library of a peer; src/stereovox_lab/bench/native.py is the other side.
 //
 // A function that returns int returns 0, or 1 after an error, which `peer_error` names. One map is used by one thread.
 // A library that takes points has peer_load and peer_insert, one that takes images peer_load_image and

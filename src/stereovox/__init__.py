@@ -12,19 +12,24 @@ if TYPE_CHECKING:
     from stereovox.cameras.rigs import StereoPair as StereoPair
     from stereovox.cameras.wide import CylindricalCamera as CylindricalCamera
     from stereovox.cameras.wide import SphericalCamera as SphericalCamera
-    from stereovox.closing import ClosedMap as ClosedMap
-    from stereovox.closing import LoopClosure as LoopClosure
-    from stereovox.closing import close_loops as close_loops
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
-    from stereovox.contents import describe as describe
-    from stereovox.corrected_poses import CorrectedPoses as CorrectedPoses
-    from stereovox.corrected_poses import OdometryJumps as OdometryJumps
-    from stereovox.corrected_poses import poses_by_path as poses_by_path
+    from stereovox.correct.close_loops import ClosedMap as ClosedMap
+    from stereovox.correct.close_loops import LoopClosure as LoopClosure
+    from stereovox.correct.close_loops import close_loops as close_loops
+    from stereovox.correct.corrected_poses import CorrectedPoses as CorrectedPoses
+    from stereovox.correct.corrected_poses import OdometryJumps as OdometryJumps
+    from stereovox.correct.corrected_poses import poses_by_path as poses_by_path
+    from stereovox.correct.merge_maps import Joined as Joined
+    from stereovox.correct.merge_maps import join as join
+    from stereovox.correct.merge_maps import merge as merge
+    from stereovox.correct.remap import Remapped as Remapped
+    from stereovox.correct.remap import remap as remap
     from stereovox.depth.cloud import deskewed as deskewed
+    from stereovox.descriptions import describe as describe
     from stereovox.errors import StereovoxError as StereovoxError
-    from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
-    from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
+    from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore as TrajectoryScore
+    from stereovox.evaluate.trajectory.trajectory_score import score_trajectory as score_trajectory
     from stereovox.fleet import FleetMap as FleetMap
     from stereovox.fleet import FleetPlan as FleetPlan
     from stereovox.fleet import FleetScores as FleetScores
@@ -32,8 +37,6 @@ if TYPE_CHECKING:
     from stereovox.fleet import map_fleet as map_fleet
     from stereovox.fleet import plan_fleet as plan_fleet
     from stereovox.fleet import score_fleet as score_fleet
-    from stereovox.floor_run import FloorRun as FloorRun
-    from stereovox.floor_run import map_floor as map_floor
     from stereovox.formats import export as export
     from stereovox.formats import import_map as import_map
     from stereovox.formats.meshes import surface as surface
@@ -44,11 +47,6 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
-    from stereovox.joining import Joined as Joined
-    from stereovox.joining import join as join
-    from stereovox.joining import merge as merge
-    from stereovox.lab.flights.campaign import explore as explore
-    from stereovox.lab.flights.explore import Cruise as Cruise
     from stereovox.live.rig import LiveCamera as LiveCamera
     from stereovox.live.run import LiveResult as LiveResult
     from stereovox.live.run import LiveRun as LiveRun
@@ -57,12 +55,14 @@ if TYPE_CHECKING:
     from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
+    from stereovox.mapping.rebuild import CorrectionReport as CorrectionReport
     from stereovox.maps import State as State
     from stereovox.maps import VoxelMap as VoxelMap
     from stereovox.maps import load_map as load_map
     from stereovox.maps import save_boxed as save_boxed
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.maps.record.health import Health as Health
     from stereovox.mavlink.directions import DirectionRules as DirectionRules
     from stereovox.mavlink.link import MavlinkLink as MavlinkLink
     from stereovox.mavlink.poses import PoseReceiver as PoseReceiver
@@ -76,27 +76,25 @@ if TYPE_CHECKING:
     from stereovox.products.crop import crop as crop
     from stereovox.products.difference import difference as difference
     from stereovox.products.distance import DistanceField as DistanceField
+    from stereovox.products.floor.ground import ground as ground
+    from stereovox.products.floor.level_ways import LevelWays as LevelWays
     from stereovox.products.frontiers import frontiers as frontiers
-    from stereovox.products.ground import ground as ground
-    from stereovox.products.level_ways import LevelWays as LevelWays
     from stereovox.products.path_check import check_path as check_path
-    from stereovox.rebuild import CorrectionReport as CorrectionReport
-    from stereovox.remapping import Remapped as Remapped
-    from stereovox.remapping import remap as remap
     from stereovox.ros.nav2 import write_nav2 as write_nav2
-    from stereovox.run import MapResult as MapResult
-    from stereovox.run import MapRun as MapRun
-    from stereovox.run import map_recording as map_recording
+    from stereovox.runs.floor import FloorRun as FloorRun
+    from stereovox.runs.floor import map_floor as map_floor
+    from stereovox.runs.recording import MapResult as MapResult
+    from stereovox.runs.recording import MapRun as MapRun
+    from stereovox.runs.recording import map_recording as map_recording
+    from stereovox.runs.trajectory import CameraTrack as CameraTrack
+    from stereovox.runs.trajectory import track_recording as track_recording
     from stereovox.sources.imu import ImuReadings as ImuReadings
     from stereovox.sources.imu import LiveImu as LiveImu
     from stereovox.sources.latest import Latest as Latest
-    from stereovox.sources.live_poses import LivePoses as LivePoses
-    from stereovox.sources.poses import Poses as Poses
+    from stereovox.sources.poses.live_poses import LivePoses as LivePoses
+    from stereovox.sources.poses.poses import Poses as Poses
     from stereovox.track.tracker import Tracked as Tracked
     from stereovox.track.tracker import Tracker as Tracker
-    from stereovox.track_run import CameraTrack as CameraTrack
-    from stereovox.track_run import track_recording as track_recording
-    from stereovox.trust.health import Health as Health
     from stereovox.view.loops import loops_picture as loops_picture
     from stereovox.view.trajectory import trajectory_picture as trajectory_picture
     from stereovox.viewer.live import LiveView as LiveView
@@ -120,53 +118,51 @@ _HOMES = {
     "SphericalCamera": "cameras.wide",
     "CylindricalCamera": "cameras.wide",
     "Reason": "frame",
-    "Health": "trust.health",
+    "Health": "maps.record.health",
     "AnyMapper": "mapper",
     "GridMapper": "mapper",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
-    "CorrectionReport": "rebuild",
+    "CorrectionReport": "mapping.rebuild",
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
     "save_boxed": "maps",
-    "describe": "contents",
+    "describe": "descriptions",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
-    "TrajectoryScore": "evaluate.trajectory_score",
-    "score_trajectory": "evaluate.trajectory_score",
+    "TrajectoryScore": "evaluate.trajectory.trajectory_score",
+    "score_trajectory": "evaluate.trajectory.trajectory_score",
     "export": "formats",
     "import_map": "formats",
     "DistanceField": "products.distance",
-    "LevelWays": "products.level_ways",
+    "LevelWays": "products.floor.level_ways",
     "check_path": "products.path_check",
     "coarsen": "products.coarsen",
     "crop": "products.crop",
     "difference": "products.difference",
     "frontiers": "products.frontiers",
-    "ground": "products.ground",
-    "Joined": "joining",
-    "join": "joining",
-    "merge": "joining",
-    "CorrectedPoses": "corrected_poses",
-    "OdometryJumps": "corrected_poses",
-    "poses_by_path": "corrected_poses",
+    "ground": "products.floor.ground",
+    "Joined": "correct.merge_maps",
+    "join": "correct.merge_maps",
+    "merge": "correct.merge_maps",
+    "CorrectedPoses": "correct.corrected_poses",
+    "OdometryJumps": "correct.corrected_poses",
+    "poses_by_path": "correct.corrected_poses",
     "deskewed": "depth.cloud",
-    "Poses": "sources.poses",
-    "ClosedMap": "closing",
-    "LoopClosure": "closing",
-    "close_loops": "closing",
-    "Remapped": "remapping",
-    "remap": "remapping",
+    "Poses": "sources.poses.poses",
+    "ClosedMap": "correct.close_loops",
+    "LoopClosure": "correct.close_loops",
+    "close_loops": "correct.close_loops",
+    "Remapped": "correct.remap",
+    "remap": "correct.remap",
     "surface": "formats.meshes",
-    "FloorRun": "floor_run",
-    "map_floor": "floor_run",
-    "Cruise": "lab.flights.explore",
-    "explore": "lab.flights.campaign",
+    "FloorRun": "runs.floor",
+    "map_floor": "runs.floor",
     "write_nav2": "ros.nav2",
-    "MapResult": "run",
-    "MapRun": "run",
-    "map_recording": "run",
+    "MapResult": "runs.recording",
+    "MapRun": "runs.recording",
+    "map_recording": "runs.recording",
     "LiveCamera": "live.rig",
     "LiveResult": "live.run",
     "LiveRun": "live.run",
@@ -190,11 +186,11 @@ _HOMES = {
     "ImuReadings": "sources.imu",
     "LiveImu": "sources.imu",
     "Latest": "sources.latest",
-    "LivePoses": "sources.live_poses",
+    "LivePoses": "sources.poses.live_poses",
     "Tracked": "track.tracker",
     "Tracker": "track.tracker",
-    "CameraTrack": "track_run",
-    "track_recording": "track_run",
+    "CameraTrack": "runs.trajectory",
+    "track_recording": "runs.trajectory",
     "loops_picture": "view.loops",
     "trajectory_picture": "view.trajectory",
     "open_viewer": "viewer.viewer",

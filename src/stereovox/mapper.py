@@ -11,28 +11,28 @@ from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
 
-from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
-from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
 from stereovox.depth.quality import checked_scan
-from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Cloud, Frame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
-from stereovox.intake import Aged, Intake
+from stereovox.frame.stamp_clock import StampsBy
+from stereovox.frame.validate import validate_upright_scan
 from stereovox.integrate.beams import make_beams
+from stereovox.kernels.device import check_on_processor, on_usable_device
+from stereovox.kernels.threads import MapLock, uninterrupted
+from stereovox.mapping.comparison import Comparison
+from stereovox.mapping.deadline import Deadline, Levels
+from stereovox.mapping.gate import Passed
+from stereovox.mapping.intake import Aged, Intake
+from stereovox.mapping.rebuild import CorrectionReport, FramePoses, correct
 from stereovox.maps import VoxelMap, make_map
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
-from stereovox.maps.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.rebuild import CorrectionReport, FramePoses, correct
-from stereovox.threads import MapLock, uninterrupted
-from stereovox.trust.gate import Passed
-from stereovox.trust.health import Health
-from stereovox.trust.stamp_clock import StampsBy
-from stereovox.trust.validate import validate_upright_scan
+from stereovox.maps.record.health import Health
+from stereovox.maps.record.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 
 SeenT = TypeVar("SeenT", contravariant=True)
 

@@ -15,7 +15,7 @@ from typing import Any
 from stereovox import registry
 from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, NoPoses, SourceError, shortened
 from stereovox.formats import IMPORTS, UNREADABLE
-from stereovox.maps.lock import LOCK
+from stereovox.maps.files.lock import LOCK
 from stereovox.sources.bags.files import cut_off
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
@@ -27,20 +27,20 @@ from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.foreign_files import cure_of
 from stereovox.sources.latest import LatestStream
 from stereovox.sources.paced import Paced
-from stereovox.sources.pair_file import PairSettings
 from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rigs.pair_file import PairSettings
 from stereovox.sources.robots.robot import Robot
 
 SOURCES = {
-    "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
-    "seven_scenes": "stereovox.sources.rgbd.seven_scenes:SevenScenes",
-    "icl_nuim": "stereovox.sources.rgbd.icl_nuim:IclNuim",  # before tum: it may hold groundtruth.txt as well
-    "icl_scene": "stereovox.sources.rgbd.icl_nuim:IclNuimScene",
-    "sun3d": "stereovox.sources.rgbd.sun3d:Sun3d",
-    "tum": "stereovox.sources.rgbd.tum:TumRgbd",
-    "rig": "stereovox.sources.rig:StereoRig",
+    "pair": "stereovox.sources.rigs.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
+    "seven_scenes": "stereovox.sources.rgbd.layouts.seven_scenes:SevenScenes",
+    "icl_nuim": "stereovox.sources.rgbd.layouts.icl_nuim:IclNuim",  # before tum: it may hold groundtruth.txt as well
+    "icl_scene": "stereovox.sources.rgbd.layouts.icl_nuim:IclNuimScene",
+    "sun3d": "stereovox.sources.rgbd.layouts.sun3d:Sun3d",
+    "tum": "stereovox.sources.rgbd.layouts.tum:TumRgbd",
+    "rig": "stereovox.sources.rigs.rig:StereoRig",
     "asl": "stereovox.sources.asl:AslRig",
-    "two_view": "stereovox.sources.two_view:TwoView",
+    "two_view": "stereovox.sources.rigs.two_view:TwoView",
     "velodyne": "stereovox.sources.clouds.velodyne:Velodyne",  # before KITTI's images, which are in the same folders
     "camera_and_velodyne": "stereovox.sources.clouds.velodyne:CameraAndVelodyne",
     "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
@@ -49,26 +49,26 @@ SOURCES = {
     "kitti_stereo2015": "stereovox.sources.kitti.stereo2015:KittiStereo2015",
     "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.simulate.simulation:Simulation",
-    "rtabmap_db": "stereovox.sources.rgbd.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
+    "rtabmap_db": "stereovox.sources.rgbd.layouts.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
     "bag_clouds": "stereovox.sources.clouds.bag:BagClouds",  # before the depth images of the same bag
     "bag": "stereovox.sources.bags.recording:Bag",
     "sens": "stereovox.sources.rgbd.packed:SensFile",
-    "klg": "stereovox.sources.rgbd.klg:KlgLog",
+    "klg": "stereovox.sources.rgbd.layouts.klg:KlgLog",
     "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
-    "replica": "stereovox.sources.rgbd.replica:Replica",
-    "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
-    "nerfstudio": "stereovox.sources.rgbd.nerfstudio:NerfTransforms",
-    "rtabmap": "stereovox.sources.rgbd.rtabmap:RtabmapExport",
-    "colmap": "stereovox.sources.rgbd.colmap:Colmap",
-    "tartanair": "stereovox.sources.rgbd.tartanair:TartanAir",
-    "polycam": "stereovox.sources.rgbd.polycam:Polycam",
-    "record3d": "stereovox.sources.rgbd.record3d:Record3D",
-    "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
+    "replica": "stereovox.sources.rgbd.layouts.replica:Replica",
+    "open3d": "stereovox.sources.rgbd.layouts.open3d:Open3DFolder",
+    "nerfstudio": "stereovox.sources.rgbd.layouts.nerfstudio:NerfTransforms",
+    "rtabmap": "stereovox.sources.rgbd.layouts.rtabmap:RtabmapExport",
+    "colmap": "stereovox.sources.rgbd.layouts.colmap:Colmap",
+    "tartanair": "stereovox.sources.rgbd.layouts.tartanair:TartanAir",
+    "polycam": "stereovox.sources.rgbd.layouts.polycam:Polycam",
+    "record3d": "stereovox.sources.rgbd.layouts.record3d:Record3D",
+    "stray_scanner": "stereovox.sources.rgbd.layouts.stray_scanner:StrayScanner",
     "clouds": "stereovox.sources.clouds.folder:CloudFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
-STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
+STREAMS = {"realsense": "stereovox.sources.realsense.realsense:RealSense"}
 """Live cameras, which cannot be rewound; entry points in the group `stereovox.streams`."""
 ROBOTS = {
     "floor": "stereovox.simulate.floors.floor:Floor",
@@ -187,7 +187,7 @@ def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
     A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
     source that recognises it, with its `depth_only(where)`. Raises SourceError where there are no depth images.
     """
-    from stereovox.sources.pair import CorrectedDepth
+    from stereovox.sources.rigs.pair import CorrectedDepth
 
     source = _depth_of(os.path.join(folder, settings.depth))
     if settings.depth_scale is None and settings.baseline is None:
@@ -242,8 +242,8 @@ def _images_alone(where: str) -> DepthSource:
 
 def _image_classes() -> tuple[Any, ...]:
     """Return the classes of depth images without poses."""
+    from stereovox.sources.rgbd.layouts.tum import StampedImages
     from stereovox.sources.rgbd.plain import DepthOnly
-    from stereovox.sources.rgbd.tum import StampedImages
 
     return StampedImages, DepthOnly
 

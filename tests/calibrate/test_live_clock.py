@@ -12,10 +12,10 @@ from stereovox.config import load_config
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import FrameRefused
 from stereovox.frame import Cloud
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
-from stereovox.sources.live_poses import LivePoses
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.live_poses import LivePoses
+from stereovox.sources.poses.poses import Poses
 
 MS, AT = 1_000_000, 30
 SLOW_MS = 5

@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereovox.calibrate.pair import calibrate_pair
-from stereovox.cli import calibrate_pair as command
+from stereovox.cli.calibrate import calibrate_pair as command
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
 from stereovox.opening import Selection, open_source
 from stereovox.simulate.d435 import depth_camera
 from stereovox.sources.base import Source
-from stereovox.sources.poses import Poses
-from stereovox.sources.tracker import on_clock
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import on_clock
 
 COUNT, HZ, WIDTH = 45, 12, 160
 SECONDS, STAMPS = made.times(COUNT, HZ)

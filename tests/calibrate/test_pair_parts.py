@@ -16,8 +16,8 @@ from stereovox.calibrate.tracker import PoseTrack, find_offsets
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import DepthImage, Reason
-from stereovox.se3 import inverse
-from stereovox.sources.poses import Poses
+from stereovox.geometry.se3 import inverse
+from stereovox.sources.poses.poses import Poses
 
 RANDOM = np.random.default_rng(5)
 

@@ -19,8 +19,8 @@ from stereovox.calibrate.stereo import (
 )
 from stereovox.calibrate.stereo_fit import fit_stereo
 from stereovox.errors import StereovoxError
-from stereovox.report.stereo import write_stereo_report
-from stereovox.se3 import inverse, rotation_vector, transform_points
+from stereovox.geometry.se3 import inverse, rotation_vector, transform_points
+from stereovox.view.report.stereo import write_stereo_report
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/chessboard_stereo"
 

@@ -10,7 +10,7 @@ from made_recordings import write_png
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.sources.camera_file import read_camera
+from stereovox.sources.calibration.camera_file import read_camera
 
 WALL = "sim:wall?image_width=212&frames=10&subpixel=0.01&barrel=0.1&distance={}"
 QUIET = "sim:wall?image_width=212&frames=10&distance={}"

@@ -9,7 +9,7 @@ import pytest
 from made_boards import BOARD, pinhole_eyes, poses, write_boards
 
 from stereovox.cli import main
-from stereovox.sources.rig_file import read_rig
+from stereovox.sources.rigs.rig_file import read_rig
 
 KITTI = """S_rect_00: 1.242000e+03 3.750000e+02
 R_rect_00: 1 0 0 0 1 0 0 0 1

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereovox import run
 from stereovox.cli import main
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.lock import only_writer_in, only_writer_of
-from stereovox.run import REST, Checkpoints
+from stereovox.maps.files.lock import only_writer_in, only_writer_of
+from stereovox.runs import recording as run
+from stereovox.runs.recording import REST, Checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = "sim:room?image_width=64&frames=30"
@@ -104,7 +104,7 @@ def at_each_frame(monkeypatch, out, look):
         return add(self, frame)
 
     monkeypatch.setattr(Mapper, "add", looking)
-    monkeypatch.setattr("stereovox.run.REST", 0)
+    monkeypatch.setattr("stereovox.runs.recording.REST", 0)
     return ["--checkpoint", "1e-9"]
 
 
@@ -149,7 +149,7 @@ def test_refused_frames_do_not_take_the_place_of_an_older_map(tmp_path, monkeypa
 
 @pytest.mark.parametrize("seconds", ["0", "1e-9"])
 def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
-    monkeypatch.setattr("stereovox.run.REST", 0)
+    monkeypatch.setattr("stereovox.runs.recording.REST", 0)
     keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
     assert mapped(tmp_path / "a", *keep) == 0
     assert mapped(tmp_path / "b", *keep, "--checkpoint", seconds) == 0
@@ -258,7 +258,7 @@ def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsy
 
 @pytest.mark.parametrize("command", ["grid", "slam"])
 def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeypatch, capsys, command):
-    monkeypatch.setattr("stereovox.floor_run.open_robot", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr("stereovox.runs.floor.open_robot", lambda _: pytest.fail("worked"))
     monkeypatch.setattr("stereovox.opening.open_robot", lambda _: pytest.fail("worked"))
     refused = []
     with only_writer_of(tmp_path / "floor.yaml"):

@@ -6,7 +6,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.sources.poses.trajectory import write_trajectory
 
 SETTINGS = {"voxel_size": 0.2, "map.keep_frames": True, "trust.max_disagreement": 1}
 

@@ -8,10 +8,10 @@ import pytest
 from made_floors import FREE, WALL, changed, looked_up, room
 
 import stereovox as sv
-from stereovox import se2
 from stereovox.cli import main
-from stereovox.evaluate.grid_scores import score_grids
+from stereovox.evaluate.grids.grid_scores import score_grids
 from stereovox.formats.map_server import read_map_server, write_map_server
+from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 
 CONTRACT = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")

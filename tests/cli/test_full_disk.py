@@ -81,6 +81,6 @@ def test_what_no_command_foresaw_is_told_with_the_cure(monkeypatch, capsys):
     def full(arguments):
         raise OSError(ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("stereovox.cli.info.run", full)
+    monkeypatch.setattr("stereovox.cli.start.info.run", full)
     assert main(["info", "a.svox"]) == 2
     assert "what was being written is not complete" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "maps" / "made_kills.py"
+SCRIPT = Path(__file__).parents[1] / "helpers/made_kills.py"
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from stereovox.cli import main
-from stereovox.cli.slam import _pace
+from stereovox.cli.map.slam import _pace
 from stereovox.formats.map_server import read_map_server
 from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.opening import open_robot
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import read_pose
-from stereovox.sources.trajectory import Trajectory
+from stereovox.sources.poses.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=24&scan_hz=4&depth_hz=2&image_width=160"
 
@@ -112,7 +112,7 @@ def test_a_doubted_map_is_written_with_a_warning_and_status_3(command, monkeypat
 def test_slam_scores_relations(tmp_path, capsys):
     scans = open_robot(DRIVE).scans
     first, second = scans[8], scans[40]
-    from stereovox import se2
+    from stereovox.geometry import se2
 
     x, y, yaw = se2.relative(*(one.pose_world_base for one in (first, second)))
     line = f"{first.stamp_ns / 1e9:.6f} {second.stamp_ns / 1e9:.6f} {x} {y} 0 0 0 {yaw}\n"

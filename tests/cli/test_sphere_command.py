@@ -8,8 +8,8 @@ import pytest
 
 from stereovox.cli import main
 from stereovox.depth.sphere import MAIN_DIRECTIONS, SphereLayout
-from stereovox.lab.checks.surround import nearest_surfaces
 from stereovox.simulate.surround import Surround
+from stereovox_lab.checks.surround import nearest_surfaces
 
 DRONE = "sim:surround?scale=0.4&moments=5"
 

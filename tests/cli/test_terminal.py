@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stereovox import _jit
 from stereovox.cli import main
-from stereovox.cli.slam import _print_result
+from stereovox.cli.map.slam import _print_result
 from stereovox.cli.terminal import say_about_compiling
+from stereovox.kernels import _jit
 
 
 @pytest.mark.parametrize("frames", [1, 2])
@@ -38,7 +38,7 @@ def test_the_first_run_on_a_machine_is_recognised(tmp_path, monkeypatch, capsys)
     ],
 )
 def test_slam_says_whether_it_compiled(seconds, compiling, words, monkeypatch, capsys):
-    monkeypatch.setattr("stereovox.cli.slam.print_trajectory_error", lambda *_: {})
+    monkeypatch.setattr("stereovox.cli.map.slam.print_trajectory_error", lambda *_: {})
     track = SimpleNamespace(stamps_ns=np.array([0, 100_000_000_000]))
     _print_result(None, SimpleNamespace(track=track, closures=3, refused={}, doubts=[]), seconds, compiling)
     assert words in capsys.readouterr().err

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-import stereovox as sv
 from entrance_cases import good
 from made_clouds import directions_of, pose, room_cloud, room_points
+
+import stereovox as sv
 from stereovox.depth import quality
 from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import FrameRefused

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_clouds import HALF, directions_of, pose, room_cloud, room_points
 
 import stereovox as sv
-from made_clouds import HALF, directions_of, pose, room_cloud, room_points
 from stereovox.depth.cloud import checked_cloud, deskewed
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
 
 CONFIG = sv.load_config()
 

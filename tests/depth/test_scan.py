@@ -13,7 +13,7 @@ from stereovox.config import load_config
 from stereovox.depth.scan import scan_of
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import DepthImage, Reason
-from stereovox.se3 import look_at, rotation_matrix
+from stereovox.geometry.se3 import look_at, rotation_matrix
 
 NONE = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)
 PINHOLE = PinholeCamera(64, 48, 60.0, 58.0, 30.7, 24.2)

@@ -8,7 +8,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth.scan import scan_of
 from stereovox.frame import DepthImage, Reason
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 from stereovox.simulate.scene import Scene, box, cylinder
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 57)

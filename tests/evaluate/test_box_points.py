@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stereovox.evaluate.lidar_truth import corners_of, in_any_box, inside
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.sources.lidar import Box
 
 RNG = np.random.default_rng(4)

@@ -20,7 +20,7 @@ from stereovox.evaluate.looks import looks, views
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.thickness import Thickness, thickness
 from stereovox.evaluate.truth_cells import Neighbourhood, TruthCells
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 
 SIZE = 0.5
 LEVELS = {"free": -2.0, "tentative": 0.2, "occupied": 2.0}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from made_floors import FREE, WALL, changed, looked_up, room
 
-from stereovox import se2
-from stereovox.evaluate.grid_align import Fit, align_grids
-from stereovox.evaluate.grid_scores import score_grids
+from stereovox.evaluate.grids.grid_align import Fit, align_grids
+from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 
 MOTIONS = [(0.0, 0.0, 0.0), (0.13, -0.21, 0.06), (-7.0, 5.0, 2.9)]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_floors import FREE, WALL, changed, random_floor, room
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grid_lattice import lay
-from stereovox.evaluate.grid_scores import Difference, differences, score_grids, wrong
+from stereovox.evaluate.grids.grid_lattice import lay
+from stereovox.evaluate.grids.grid_scores import Difference, differences, score_grids, wrong
+from stereovox.geometry import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 

@@ -11,7 +11,7 @@ import pytest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.lidar_truth import blocks_in, project, view_volume
 from stereovox.frame import Viewpoint
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 
 CAMERA = PinholeCamera(40, 24, 30.0, 33.0, 17.0, 13.5)
 

@@ -11,9 +11,9 @@ import pytest
 
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.evaluate.lidar_truth import lidar_truth
+from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.maps import State
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, transform_points
 
 SIZE = 0.4
 RANGE = 20.0

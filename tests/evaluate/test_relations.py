@@ -6,9 +6,9 @@ from math import pi, sqrt
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.errors import SourceError
-from stereovox.evaluate.trajectory import read_relations, relation_errors, score_relations
+from stereovox.evaluate.trajectory.trajectory import read_relations, relation_errors, score_relations
+from stereovox.geometry import se2
 from stereovox.localize.track import Track
 
 STAMPS = np.array([0, 1, 2, 3], np.int64) * 10**9

@@ -17,10 +17,10 @@ from stereovox.evaluate.outcomes import Outcome, outcomes
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import CellReader, Neighbourhood, TruthCells
 from stereovox.frame import Viewpoint
-from stereovox.lab.papers.valenti.judge import ScoreSeries
 from stereovox.maps import make_map
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.rolling import RollingMap
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.rolling import RollingMap
+from stereovox_lab.papers.valenti.judge import ScoreSeries
 
 SIZE = 0.5
 MEANING = {

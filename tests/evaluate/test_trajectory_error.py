@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory import best_motion, trajectory_error
+from stereovox.evaluate.trajectory.trajectory import best_motion, trajectory_error
+from stereovox.geometry import se2
 from stereovox.localize.track import Track
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 STAMPS = np.arange(101) * 50_000_000 + 7
 ALONG = np.linspace(0, 10, 101)

@@ -6,7 +6,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.cells import indices, keys, position, within
 from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import exact_occupancy, interior_cells, longest_axis, touched_cells
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 from stereovox.simulate.scene import Scene, box, cylinder
 
 

@@ -21,19 +21,19 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from made_clouds import room_cloud
 from made_fleet import SETTINGS, alone, assert_same, recording
 
 import stereovox as sv
-from made_clouds import room_cloud
-from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
+from stereovox.files.places import Place
 from stereovox.fleet import Recording, boxes, cluster, fleet, map_fleet, plan_fleet, recordings, recordings_of
 from stereovox.fleet.recordings import boxes_with, fingerprint, local
-from stereovox.maps import pyramid
-from stereovox.maps.boxes import BoxLayout
-from stereovox.maps.evidence import Evidence
-from stereovox.places import Place
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.mapping.deadline import Levels
+from stereovox.maps.cells import pyramid
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.boxes import BoxLayout
+from stereovox.sources.poses.trajectory import write_trajectory
 
 distributed = pytest.importorskip("distributed")
 

@@ -12,7 +12,7 @@ import stereovox as sv
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats import UNREADABLE, import_map
 from stereovox.maps import VoxelMap
-from stereovox.trust.history import Imported
+from stereovox.maps.record.history import Imported
 
 WALL = np.stack(np.meshgrid(np.arange(0, 2, 0.02), [0.31], np.arange(0, 1, 0.02), indexing="ij"), -1).reshape(-1, 3)
 UTM = np.array([512_345.0, 5_403_210.0, 100.0])

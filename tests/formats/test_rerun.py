@@ -9,7 +9,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.cli.live_page import rerun_of
+from stereovox.cli.look.live_page import rerun_of
 from stereovox.errors import MissingExtra
 from stereovox.formats import export
 from stereovox.frame import UpdateReport

@@ -15,14 +15,14 @@ from numba.core.config import ENABLE_CUDASIM
 from numba.cuda.simulator.kernel import BlockThread
 
 import stereovox as sv
-from stereovox._gpu import gpu_array
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.integrate import gpu as integrate_gpu
 from stereovox.integrate import make_integrator
-from stereovox.maps import gpu as maps_gpu
+from stereovox.kernels._gpu import gpu_array
 from stereovox.maps import make_map
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.storage import Storage
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage import gpu as maps_gpu
+from stereovox.maps.storage.storage import Storage
 from stereovox.sensors import SENSORS
 
 assert ENABLE_CUDASIM, "run test_gpu.py, which asks for the simulator"
@@ -241,7 +241,7 @@ def test_a_map_outgrows_its_room(monkeypatch):
 
 
 def test_how_far_a_frame_agrees_with_the_map_is_as_on_the_processor(monkeypatch):
-    monkeypatch.setattr("stereovox.maps.frame_agreement.SAMPLE", 3)  # so that blocks are left out
+    monkeypatch.setattr("stereovox.maps.record.frame_agreement.SAMPLE", 3)  # so that blocks are left out
     maps = [grown(device, (0, 2))[0] for device in ("cuda", "cpu")]
     mine, its = (one.storage.agreement(evidence_of(2), 100) for one in maps)
     assert mine == its

@@ -37,7 +37,7 @@ def to_gpu(array):
 def gpu_array(shape, dtype, value=None):
     array = np.full(shape, 0 if value is None else value, dtype).view(OnCard)
     if value is not None:
-        launch(stereovox._gpu.fill, array.reshape(array.size), np.dtype(dtype).type(value))
+        launch(stereovox.kernels._gpu.fill, array.reshape(array.size), np.dtype(dtype).type(value))
     return array
 
 
@@ -87,12 +87,16 @@ def run():
 
 
 import stereovox  # noqa: E402
-import stereovox._gpu  # noqa: E402
+import stereovox.kernels._gpu  # noqa: E402
 
-stereovox._gpu.launch, stereovox._gpu.to_gpu, stereovox._gpu.gpu_array = launch, to_gpu, gpu_array
-stereovox._gpu.unusable = lambda: None
+stereovox.kernels._gpu.launch, stereovox.kernels._gpu.to_gpu, stereovox.kernels._gpu.gpu_array = (
+    launch,
+    to_gpu,
+    gpu_array,
+)
+stereovox.kernels._gpu.unusable = lambda: None
 from stereovox.integrate.gpu import GpuProjective  # noqa: E402
-from stereovox.maps.gpu import GpuStorage  # noqa: E402
+from stereovox.maps.storage.gpu import GpuStorage  # noqa: E402
 
 for text in sys.argv[1:]:
     card, found = tuple(map(int, text.split("."))), {}

@@ -14,11 +14,11 @@ import pytest
 from numba import cuda
 
 import stereovox as sv
-from stereovox import _gpu
 from stereovox.cli import main
-from stereovox.device import on_usable_device
 from stereovox.errors import ConfigError
 from stereovox.integrate import make_integrator
+from stereovox.kernels import _gpu
+from stereovox.kernels.device import on_usable_device
 from stereovox.maps import make_map
 
 HERE = Path(__file__).parent
@@ -62,7 +62,7 @@ def test_all_kernels_become_machine_code():
 
 def all_kernels():
     """Return the names of all kernels for cards, from the text of their files."""
-    for path in sorted((HERE.parents[1] / "src/stereovox").rglob("_gpu.py")):
+    for path in sorted((HERE.parents[1] / "src/stereovox").rglob("kernels/_gpu.py")):
         module = ".".join(("stereovox", *path.relative_to(HERE.parents[1] / "src/stereovox").with_suffix("").parts))
         lines = path.read_text().splitlines()
         for before, line in pairwise(lines):
@@ -97,7 +97,7 @@ def test_a_card_that_can_be_used_is_used(monkeypatch):
 
 
 def test_a_library_that_does_not_load_is_no_card(monkeypatch):
-    monkeypatch.setitem(sys.modules, "stereovox._gpu", None)
+    monkeypatch.setitem(sys.modules, "stereovox.kernels._gpu", None)
     said = []
     assert on_usable_device(sv.load_config(device="cuda"), said.append).device == "cpu"
     assert said[0].startswith('device "cuda": numba-cuda cannot be loaded (')

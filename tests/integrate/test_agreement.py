@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.lab.checks.agreement import agreement
 from stereovox.simulate.simulation import Simulation
+from stereovox_lab.checks.agreement import agreement
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
 HIT_OR_MISS = {"sensor.model": "constant", "map.prior": 0.5, "map.log_odds_min": -2.0}

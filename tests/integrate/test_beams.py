@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_beams import scan_cells
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.integrate.beams import make_beams
 
 KINDS = [(traversal, update) for traversal in ("exact", "bresenham") for update in ("once", "every")]

@@ -16,7 +16,7 @@ from stereovox.frame import Reason
 from stereovox.integrate import views
 from stereovox.integrate.views import MAX_CAMERAS, PerCamera
 from stereovox.mapper import GridMapper
-from stereovox.maps.blocks import CELLS
+from stereovox.maps.storage.blocks import CELLS
 
 PIXEL = {"width": 1, "height": 1, "cx": 0.0, "cy": 0.0}
 

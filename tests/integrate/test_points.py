@@ -12,9 +12,9 @@ from stereovox.cameras.lidar import Lidar
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import CheckedCloud
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.integrate import Integration
 from stereovox.integrate.points import Points
-from stereovox.se3 import rotation_matrix
 from stereovox.sensors import SENSORS, make_sensor
 
 

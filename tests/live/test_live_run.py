@@ -22,20 +22,20 @@ from stereovox.config import load_config
 from stereovox.depth.sphere import T_BODY_OPTICAL, surroundings
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
+from stereovox.geometry.se3 import inverse
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun, map_live
 from stereovox.live.stream import LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import State, load_map
 from stereovox.opening import open_source
-from stereovox.pose_choice import GIVEN, TRACK
-from stereovox.products.projection import project
-from stereovox.se3 import inverse
+from stereovox.products.floor.projection import project
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.base import Stream
-from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.paced import Paced
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.live_poses import LivePoses
+from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracked
 
 SMALL = {"voxel_size": 0.1, "max_range": 4.0}

@@ -16,6 +16,7 @@ from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Frame, Photo, UpdateReport
+from stereovox.frame.wall_clock import epoch_ns
 from stereovox.live.latency import Latency
 from stereovox.live.outputs import GridFile, LiveSphere
 from stereovox.live.recorder import WAITING, Recorder, optical, topic
@@ -23,7 +24,6 @@ from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
 from stereovox.sources.bags.writer import BagWriter
-from stereovox.trust.wall_clock import epoch_ns
 
 MS = 1_000_000
 SETTINGS = {"voxel_size": 0.1, "max_range": 4.0}

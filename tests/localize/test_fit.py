@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.fit import fit_share
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid

@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.track import Track
 
 STAMPS = np.array([1_000, 2_000, 4_000]) + 1_700_000_000_000_000_000

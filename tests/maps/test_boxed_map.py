@@ -7,16 +7,17 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from made_manifest import manifest_in, put_manifest
 
 import stereovox as sv
-from made_manifest import manifest_in, put_manifest
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.maps import boxed_manifest, boxed_map
-from stereovox.maps.boxed_manifest import only_writer_at, read_boxed_manifest
+from stereovox.files.places import Place, is_url
+from stereovox.maps import boxed_map
 from stereovox.maps.boxed_map import BoxedMap
-from stereovox.maps.boxes import read_box
-from stereovox.maps.cell_format import State
-from stereovox.places import Place, is_url
+from stereovox.maps.cells.cell_format import State
+from stereovox.maps.files import boxed_manifest
+from stereovox.maps.files.boxed_manifest import only_writer_at, read_boxed_manifest
+from stereovox.maps.storage.boxes import read_box
 from stereovox.products.coarsen import coarsen
 
 BOX_M = 1.6
@@ -126,7 +127,7 @@ def test_parts_differences_distances_and_clouds_are_those_in_memory(saved, tmp_p
 def test_only_what_is_asked_for_is_read(saved, monkeypatch):
     big, read = sv.load_map(saved), []
     monkeypatch.setattr(
-        "stereovox.maps.boxed_storage.read_box", lambda *given: read.append(given[-1].box) or read_box(*given)
+        "stereovox.maps.storage.boxed_storage.read_box", lambda *given: read.append(given[-1].box) or read_box(*given)
     )
     assert big.counts() == flight().counts()
     assert not read
@@ -169,7 +170,7 @@ def test_levels_are_the_map_in_larger_cells(kept):
 
 def test_boxes_of_an_odd_number_of_blocks_have_levels_as_well(tmp_path, monkeypatch):
     """A block of the next level then lies in two boxes."""
-    monkeypatch.setattr("stereovox.maps.pyramid.SMALL", 100)
+    monkeypatch.setattr("stereovox.maps.cells.pyramid.SMALL", 100)
     sv.save_boxed(flight(), tmp_path / "m.svox", 2.4)
     big, coarse = sv.load_map(tmp_path / "m.svox"), flight()
     assert big.manifest.layout.side == 24

@@ -9,8 +9,8 @@ import pytest
 from stereovox.config import load_config
 from stereovox.errors import ConfigError
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cell_format import CellRules
-from stereovox.maps.evidence import Evidence, GridEvidence
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.cells.evidence import Evidence, GridEvidence
 from stereovox.maps.grid_map import GridMap
 
 NONE = np.empty((0, 3), np.int32)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
+from stereovox.geometry import se2
 from stereovox.maps import State
-from stereovox.maps.evidence import CELLS, GridEvidence
+from stereovox.maps.cells.evidence import CELLS, GridEvidence
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 

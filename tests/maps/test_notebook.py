@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 import stereovox as sv
-from stereovox.trust.camera_path import Seen
+from stereovox.maps.record.camera_path import Seen
 
 CLEAR, FREE, TENTATIVE, RED = (0, 0, 0, 0), (226, 224, 212, 255), (232, 163, 61, 255), (224, 69, 47, 255)
 GREY, WALL = (128, 134, 145, 110), (34, 48, 74, 255)

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereovox.config import load_config
-from stereovox.maps import cell_pool, load_map, make_map
-from stereovox.maps.evidence import GridEvidence
+from stereovox.maps import load_map, make_map
+from stereovox.maps.cells import cell_pool
+from stereovox.maps.cells.evidence import GridEvidence
 from stereovox.maps.grid_map import GridMap, load_grid
 
 WINDOWS = {

@@ -10,7 +10,7 @@ from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.integrate import make_integrator
 from stereovox.maps import State, load_map, make_map
-from stereovox.maps.cubes import in_cubes
+from stereovox.maps.storage.cubes import in_cubes
 
 STEPS = (0.1, 0.25, 0.15)
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import State, VoxelMap, load_map
-from stereovox.maps.blocks import blocks_of_cells
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.blocks import blocks_of_cells
 
 CONFIG = load_config(voxel_size=0.1)
 LOWEST, HIGHEST = -4000, 3500

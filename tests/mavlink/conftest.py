@@ -17,7 +17,13 @@ class Autopilot:
     """A running `autopilot.py` and what it has told so far."""
 
     def __init__(self, ahead_s=1234.5, poses="none", port=0):
-        words = [sys.executable, str(Path(__file__).with_name("autopilot.py")), str(port), str(ahead_s), poses]
+        words = [
+            sys.executable,
+            str(Path(__file__).parents[1] / "helpers/autopilot.py"),
+            str(port),
+            str(ahead_s),
+            poses,
+        ]
         self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         self._lines = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.lab.flights.late import Delay, LateLoop, LateSetup, fly_late
 from stereovox.mavlink.body import Body, BodyPose
 from stereovox.mavlink.link import dialect
 from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
+from stereovox_lab.flights.late import Delay, LateLoop, LateSetup, fly_late
 
 S = 1_000_000_000
 LATE = (

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from stereovox import Cloud, Mapper, MapRun, ObstacleSender, StereovoxError, open_source
+from stereovox.geometry.se3 import inverse
 from stereovox.mavlink.directions import DirectionRules
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
 from stereovox.mavlink.sending import HIGHEST_RATE_HZ
-from stereovox.se3 import inverse
 
 RULES = SectorRules(max_distance=4.0)
 

@@ -6,12 +6,12 @@ from autopilot import flown
 from made_live import Clouds, Images, Sender
 
 from stereovox import StereovoxError
+from stereovox.geometry.se3 import rotation_vector
 from stereovox.live.poses import open_poses
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import map_live
 from stereovox.mavlink.stream import MavlinkPoses
-from stereovox.se3 import rotation_vector
-from stereovox.sources.live_poses import LivePoses
+from stereovox.sources.poses.live_poses import LivePoses
 
 SMALL = {"voxel_size": 0.1, "max_range": 4.0}
 

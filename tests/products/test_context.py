@@ -15,18 +15,18 @@ import stereovox as sv
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import StereovoxError
 from stereovox.formats import EXPORTS
+from stereovox.frame.stamp_clock import StampClock
 from stereovox.live import outputs as live_outputs
 from stereovox.live.outputs import GridFile, LiveSphere
 from stereovox.maps import State
+from stereovox.maps.record import health
 from stereovox.mavlink import directions, sectors
 from stereovox.mavlink.body import Body
 from stereovox.mavlink.link import dialect
-from stereovox.products import projection
 from stereovox.products.context import OUTPUTS, context_of
-from stereovox.products.projection import project
-from stereovox.sources.live_poses import LivePoses
-from stereovox.trust import health
-from stereovox.trust.stamp_clock import StampClock
+from stereovox.products.floor import projection
+from stereovox.products.floor.projection import project
+from stereovox.sources.poses.live_poses import LivePoses
 
 S = 1_000_000_000
 CAMERA = sv.PinholeCamera.from_field_of_view(48, 36, 90.0)
@@ -173,7 +173,7 @@ def diagnostics_say(figure):
 
 
 def odometry_is_silent():
-    from stereovox.ros.motion import MotionPublisher
+    from stereovox.ros.poses.motion import MotionPublisher
 
     sent = []
     publisher = MotionPublisher(node(sent, []), False, lambda stamp_ns: "old")

@@ -12,10 +12,10 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
 from stereovox.maps import State
-from stereovox.maps.storage import Storage
+from stereovox.maps.storage.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
-from stereovox.products.live_projection import STEP, LiveProjection
-from stereovox.products.projection import project
+from stereovox.products.floor.live_projection import STEP, LiveProjection
+from stereovox.products.floor.projection import project
 from stereovox.simulate.simulation import Simulation
 
 CAMERA = PinholeCamera.from_field_of_view(24, 18, 80.0)

@@ -13,9 +13,9 @@ from scipy.optimize import linprog
 
 import stereovox as sv
 from stereovox import Mapper, State, StereovoxError, VoxelMap, load_config
-from stereovox.maps.rolling import RollingMap
+from stereovox.geometry.se3 import from_quaternion, inverse, rotation_matrix, transform_points
+from stereovox.maps.storage.rolling import RollingMap
 from stereovox.products.moved import moved
-from stereovox.se3 import from_quaternion, inverse, rotation_matrix, transform_points
 
 BOX = np.array([-0.63, -1.0, -0.31]), np.array([0.72, 0.4, 1.0])
 WORST = (State.OCCUPIED, State.TENTATIVE, State.UNKNOWN, State.FREE)

@@ -9,9 +9,9 @@ import wire
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import Cloud, Scan
-from stereovox.ros.clocks import Pace, SensorClocks
-from stereovox.ros.localization import Localization, LocalizedPoses, Localizer, LocalizingScanInput
-from stereovox.ros.poses import LiveEdge, PoseBuffer, SensorPoses
+from stereovox.ros.poses.clocks import Pace, SensorClocks
+from stereovox.ros.poses.localization import Localization, LocalizedPoses, Localizer, LocalizingScanInput
+from stereovox.ros.poses.poses import LiveEdge, PoseBuffer, SensorPoses
 from stereovox.ros.subscriptions import arrived
 
 MS, S = 1_000_000, 1_000_000_000

@@ -11,12 +11,12 @@ from made_walks import DEPTH, OPTICAL, START_NS, T_BASE_CAMERA, base_at, depth_a
 from stereovox.cameras.lidar import Lidar
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.ros.corrections import JumpCorrections, PathCorrections, check_corrections
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.ros.inputs import CloudInput, DepthInput
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
-from stereovox.ros.poses import PoseBuffer
-from stereovox.se3 import rotation_matrix
+from stereovox.ros.poses.corrections import JumpCorrections, PathCorrections, check_corrections
+from stereovox.ros.poses.poses import PoseBuffer
 
 PATH = "/mapPath"
 SETTINGS = {

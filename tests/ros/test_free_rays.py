@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereovox import se2
+from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 from stereovox.ros.obstacles import STEP, free_ends

@@ -14,7 +14,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, RaysInput, ScanInput
-from stereovox.ros.poses import Pose
+from stereovox.ros.poses.poses import Pose
 from stereovox.sources.bags.writer_messages import packed_png
 from stereovox.sources.clouds.options import LidarOptions
 

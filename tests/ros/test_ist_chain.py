@@ -23,15 +23,15 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from std_msgs.msg import Float32  # noqa: E402
 
-from stereovox.evaluate.grid_scores import score_grids  # noqa: E402
-from stereovox.floor_run import map_floor  # noqa: E402
+from stereovox.evaluate.grids.grid_scores import score_grids  # noqa: E402
 from stereovox.formats.map_server import read_map_server  # noqa: E402
-from stereovox.ros.tf_message import tf_message  # noqa: E402
+from stereovox.ros.poses.tf_message import tf_message  # noqa: E402
+from stereovox.runs.floor import map_floor  # noqa: E402
 from stereovox.sources.bags.messages import Wire  # noqa: E402
 from stereovox.sources.bags.robot_messages import read_transforms  # noqa: E402
 
 pytest.importorskip("gtsam", reason="gtsam is not installed: pip install 'stereovox[slam]'")
-PLAYER = Path(__file__).with_name("play.py")
+PLAYER = Path(__file__).parents[1] / "helpers/play.py"
 PATIENCE_S = 120
 PATIENT = [word for name in ("late_s:=30.0", "wait_s:=30.0", "queue:=200") for word in ("-p", f"ros.{name}")]
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -11,11 +11,11 @@ import wire
 from made_chain import floor, reference
 from made_drives import along, drive, ring
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import localise
-from stereovox.ros.localization import (
+from stereovox.ros.poses.localization import (
     LocalizedPoses,
     Localizer,
     LocalizingScanInput,

@@ -8,7 +8,7 @@ from made_walks import depth_at
 from stereovox import VoxelMap
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.products.projection import project
+from stereovox.products.floor.projection import project
 from stereovox.ros.mapping import Mapping
 
 STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
 
-from stereovox.ros import motion
-from stereovox.ros.tracking import Moved
+from stereovox.ros.poses import motion
+from stereovox.ros.poses.tracking import Moved
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import read_transforms
 

@@ -14,13 +14,14 @@ import pytest
 import yaml
 
 from stereovox.cli import main
-from stereovox.cli.ros2 import add_arguments
+from stereovox.cli.robots.ros2 import add_arguments
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.mapper import GridMapper
-from stereovox.ros import location_topics, map_server, obstacles, outputs, score
+from stereovox.ros import map_server, obstacles, outputs, score
 from stereovox.ros.nav2 import laid_over, overlay, write_nav2
 from stereovox.ros.options import PREFIX, Options, with_parameters
+from stereovox.ros.poses import location_topics
 
 TOPICS = {
     f"/{name}"

@@ -6,8 +6,8 @@ import pytest
 import wire
 
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.ros.poses import MAX_TRANSFORMS, LiveTf, PoseBuffer, fixed_transform
-from stereovox.se3 import from_quaternion
+from stereovox.geometry.se3 import from_quaternion
+from stereovox.ros.poses.poses import MAX_TRANSFORMS, LiveTf, PoseBuffer, fixed_transform
 
 MS = 1_000_000
 START = 10**12

@@ -16,11 +16,11 @@ from made_walks import DEPTH, write_room, write_walk
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.opening import open_source
-from stereovox.ros.tf_message import tf_message
+from stereovox.ros.poses.tf_message import tf_message
+from stereovox.runs.trajectory import track_recording
 from stereovox.simulate.simulation import Simulation
-from stereovox.track_run import track_recording
 
-PLAYER = Path(__file__).with_name("play.py")
+PLAYER = Path(__file__).parents[1] / "helpers/play.py"
 PATIENCE_S = 150
 PATIENT = [word for name in ("late_s:=30.0", "wait_s:=30.0", "queue:=100") for word in ("-p", f"ros.{name}")]
 """A busy machine drops nothing."""

@@ -13,8 +13,8 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed: pip install
 
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
-from stereovox.ros import tf_message as module  # noqa: E402
-from stereovox.se3 import from_quaternion  # noqa: E402
+from stereovox.geometry.se3 import from_quaternion  # noqa: E402
+from stereovox.ros.poses import tf_message as module  # noqa: E402
 
 PATIENCE_S = 30.0
 POSES = [

@@ -12,8 +12,8 @@ from made_walks import T_BASE_CAMERA
 
 from stereovox.errors import FrameRefused
 from stereovox.frame import Frame
-from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses, Tracking, moved_covariance
-from stereovox.se3 import Transform, inverse, look_at, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import Transform, inverse, look_at, rotation_matrix, rotation_vector
+from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses, Tracking, moved_covariance
 from stereovox.simulate.simulation import Simulation
 from stereovox.track.tracker import Tracked, Tracker
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse, rigidity_error
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, rigidity_error
 from stereovox.simulate.simulation import Simulation
 
 SMALL = "image_width=32"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stereovox import Mapper, StereovoxError
-from stereovox.simulate.clearance import Clearance
 from stereovox.simulate.simulation import Simulation
+from stereovox_lab.flights.clearance import Clearance
 
 
 @pytest.mark.parametrize("plan", [0, 1, 17])

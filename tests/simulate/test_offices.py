@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import Transform, look_at
 from stereovox.opening import open_source
-from stereovox.se3 import Transform, look_at
-from stereovox.simulate.offices import BACK, BAY, HALF, SHIFT, office_pose, place
+from stereovox.simulate.scenes.offices import BACK, BAY, HALF, SHIFT, office_pose, place
 from stereovox.simulate.simulation import Simulation
 
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.se3 import look_at
-from stereovox.simulate.racks import HALF, SHIFT
+from stereovox.geometry.se3 import look_at
+from stereovox.simulate.scenes.racks import HALF, SHIFT
 from stereovox.simulate.simulation import Simulation
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse, rotation_vector
 from stereovox.opening import open_depth
-from stereovox.se3 import inverse, rotation_vector
 from stereovox.simulate.recorder import MOUNT, START_NS, record
 from stereovox.simulate.simulation import Simulation
 from stereovox.simulate.t265 import T265, Drift
-from stereovox.sources.pair import CameraPair
-from stereovox.sources.pair_file import read_pair
+from stereovox.sources.rigs.pair import CameraPair
+from stereovox.sources.rigs.pair_file import read_pair
 
 STEADY = T265(
     drift=Drift(share=0, yaw_deg=0), jitter_m=0, jitter_deg=0, clock_offset_s=-3.2, clock_drift_ppm=40, settle_s=0.1

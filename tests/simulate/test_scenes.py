@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse, rigidity_error, transform_points
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, rigidity_error, transform_points
-from stereovox.simulate import plain_scenes, town
+from stereovox.simulate.scenes import plain_scenes, town
 from stereovox.simulate.simulation import SCENES, Simulation
 from stereovox.simulate.stage import Stage, rectangle
 

@@ -6,8 +6,8 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.errors import SourceError
 from stereovox.frame import Reason
+from stereovox.geometry.se3 import look_at, rigidity_error, transform_points
 from stereovox.opening import open_source
-from stereovox.se3 import look_at, rigidity_error, transform_points
 from stereovox.simulate.d435 import CAMERA, D435, beside_nearer_surface, hidden_from_right_eye
 from stereovox.simulate.scene import Scene, box, cylinder
 from stereovox.simulate.simulation import Simulation

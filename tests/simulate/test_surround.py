@@ -9,8 +9,8 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Reason, StereoFrame
+from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, transform_points
 from stereovox.simulate.surround import MOUNTS, Surround
 
 SMALL = "sim:surround?scale=0.25&moments=5"

@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereovox.errors import StereovoxError
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 from stereovox.simulate.t265 import T265, Drift, Track, write_track
-from stereovox.sources.tracker import read_tracker
+from stereovox.sources.poses.tracker import read_tracker
 
 STEADY = Drift(share=0, yaw_deg=0)
 PERFECT = T265(jitter_m=0, jitter_deg=0, drift=STEADY, clock_drift_ppm=0)

@@ -13,8 +13,8 @@ from made_rigs import FORWARD, eyes, picture, poses_text
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
 from stereovox.sources.asl import AslRig
 
 TURNED = np.array([[0.0, -1, 0, 0], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])

@@ -10,8 +10,8 @@ import pytest
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.errors import SourceError
-from stereovox.se3 import inverse, rotation_matrix
-from stereovox.sources.calibration_files import import_rig
+from stereovox.geometry.se3 import inverse, rotation_matrix
+from stereovox.sources.calibration.calibration_files import import_rig
 
 T = np.eye(4)
 T[:3, :3], T[:3, 3] = rotation_matrix([0.02, -0.03, 0.01]), (0.12, 0.003, -0.004)

@@ -10,7 +10,7 @@ from made_recordings import depth_image, seven_scenes, write_png
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.opening import open_images, open_source
-from stereovox.sources.camera_file import camera_text, read_camera, with_camera
+from stereovox.sources.calibration.camera_file import camera_text, read_camera, with_camera
 
 CORRECTION = DepthCorrection("scale", (0.1, 0, -1e-7, 1 / 3, 0, 2))
 CAMERA = PinholeCamera(16, 12, 20.1, 21.2, 7.3, 5.4, 0.05, correction=CORRECTION)

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from stereovox.sources.clock_watch import CLOCK, GONE, LATE, ClockWatch, Delays
+from stereovox.sources.poses.clock_watch import CLOCK, GONE, LATE, ClockWatch, Delays
 
 MS = 1_000_000
 

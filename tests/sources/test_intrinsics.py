@@ -4,8 +4,8 @@ from __future__ import annotations
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.sources.camera_file import find_camera
-from stereovox.sources.intrinsics import read_camera_numbers, read_intrinsics
+from stereovox.sources.calibration.camera_file import find_camera
+from stereovox.sources.calibration.intrinsics import read_camera_numbers, read_intrinsics
 
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
 

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.live_poses import KEPT, LivePoses
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.live_poses import KEPT, LivePoses
+from stereovox.sources.poses.poses import Poses
 
 MS = 1_000_000
 

@@ -14,9 +14,9 @@ from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.opening import open_source
 from stereovox.simulate.d435 import depth_camera
-from stereovox.sources.pair import CameraPair
-from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.rigs.pair import CameraPair
+from stereovox.sources.rigs.pair_file import PairSettings, pair_text, read_pair
 
 SECONDS, STAMPS = made.times(8, 10)
 CAMERAS = [made.waved(t) for t in SECONDS]

@@ -8,8 +8,8 @@ from PIL import Image
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_images, open_source
-from stereovox.se3 import rotation_matrix
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.photos import decode_photo, nearest_in_time, photo_size, read_photo, registered
 

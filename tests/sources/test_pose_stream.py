@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereovox.errors import SourceError
-from stereovox.se3 import from_quaternion
-from stereovox.sources.pose_stream import (
+from stereovox.geometry.se3 import from_quaternion
+from stereovox.sources.poses.pose_stream import (
     MAX_LINE,
     T265,
     PoseStream,
@@ -106,7 +106,7 @@ def test_a_stream_that_breaks_says_so_and_ends():
 
 
 def test_lines_over_tcp_come_again_after_the_server_hung_up(monkeypatch):
-    monkeypatch.setattr("stereovox.sources.pose_stream.RETRY_S", 0.05)
+    monkeypatch.setattr("stereovox.sources.poses.pose_stream.RETRY_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as server:
         stream = TcpPoses(f"tcp://127.0.0.1:{server.getsockname()[1]}")
         stream.start()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 MS = 1_000_000
 

@@ -17,8 +17,8 @@ from stereovox.cli import main, recordings  # noqa: E402
 from stereovox.errors import FrameRefused, MissingExtra, SourceError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
 from stereovox.opening import Excerpt, open_source, open_stream  # noqa: E402
-from stereovox.sources import realsense  # noqa: E402
-from stereovox.sources.realsense import RealSense  # noqa: E402
+from stereovox.sources.realsense import realsense  # noqa: E402
+from stereovox.sources.realsense.realsense import RealSense  # noqa: E402
 
 STILL = "realsense:?pose=fixed"
 
@@ -136,7 +136,7 @@ def test_a_colour_camera_whose_place_is_unknown_is_told_of_and_left_out(camera, 
     def unknown(one, other):
         raise RuntimeError("Requested extrinsics are not available!")
 
-    monkeypatch.setattr("stereovox.sources.realsense_photo.transform_between", unknown)
+    monkeypatch.setattr("stereovox.sources.realsense.realsense_photo.transform_between", unknown)
     stream = open_stream("realsense:")
     assert stream.notes == ("realsense:042: its colour camera is not used (Requested extrinsics are not available!)",)
     with camera.sending():

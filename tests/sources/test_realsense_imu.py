@@ -9,8 +9,8 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_stream
-from stereovox.sources import realsense
 from stereovox.sources.base import Excerpt
+from stereovox.sources.realsense import realsense
 
 WIDTH, HEIGHT = 8, 6
 TURNED = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0]

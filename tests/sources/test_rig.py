@@ -10,7 +10,7 @@ from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import SourceError
 from stereovox.frame import StereoFrame
 from stereovox.opening import open_source
-from stereovox.sources.rig_file import Rig, RigPair, write_rig
+from stereovox.sources.rigs.rig_file import Rig, RigPair, write_rig
 
 
 def test_frames_of_all_pairs_come_in_order_of_time(tmp_path):

@@ -11,7 +11,7 @@ from made_rigs import CAMERA, FORWARD, cylinder, eyes, rig
 
 from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.errors import SourceError
-from stereovox.sources.rig_file import Rig, RigPair, Virtual, read_rig, write_rig
+from stereovox.sources.rigs.rig_file import Rig, RigPair, Virtual, read_rig, write_rig
 
 MINIMAL = """
 [[pair]]

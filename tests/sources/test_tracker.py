@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.se3 import rigidity_error, rotation_matrix
-from stereovox.sources.poses import Poses
-from stereovox.sources.tracker import angles, jumps, on_clock, read_tracker
+from stereovox.geometry.se3 import rigidity_error, rotation_matrix
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import angles, jumps, on_clock, read_tracker
 
 H = math.sqrt(0.5)
 MS = 1_000_000

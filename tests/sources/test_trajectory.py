@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.trajectory import Trajectory, ns_from_seconds, seconds_from_ns
+from stereovox.sources.poses.trajectory import Trajectory, ns_from_seconds, seconds_from_ns
 
 HALF = math.sqrt(0.5)
 TWO = f"1305031102.100000 1 2 3 0 0 0 1\n1305031102.180000 2 2 5 0 0 {HALF} {HALF}\n"

@@ -13,7 +13,7 @@ from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.two_view import TwoView
+from stereovox.sources.rigs.two_view import TwoView
 
 WIDTH, HEIGHT, F, BASELINE_MM = 160, 120, 100.0, 100.0
 SHIFT = 8

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from stereovox.se3 import inverse, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import inverse, rotation_matrix, rotation_vector
 from stereovox.track.fit import Stage, both, holding, settled
 
 

@@ -9,7 +9,7 @@ import pytest
 from made_unposed import room
 
 from stereovox.config import load_config
-from stereovox.se3 import inverse, rotation_matrix
+from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.track.guided import GuidedTracker
 from stereovox.track.stream import LOST, follow
 from stereovox.track.tracker import Tracker

@@ -12,7 +12,7 @@ from naive_imu import turned
 from scipy.spatial.transform import Rotation
 
 from stereovox.frame import Frame
-from stereovox.se3 import rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import rotation_matrix, rotation_vector
 from stereovox.sources.imu import ImuReadings
 from stereovox.track.inertial import Gyroscope, Turn, integrate, up_by_force
 

@@ -11,7 +11,7 @@ from made_photographs import BASELINE, CAMERA, LENS, PAIR, STEP_NS, corner, phot
 from made_tracks import simulated, track
 
 from stereovox.errors import StereovoxError
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.track.pairs import DISPARITY
 from stereovox.track.sightings import ALIKE, PIXEL, Corners, Sightings
 from stereovox.track.tracker import Tracker

@@ -12,8 +12,8 @@ from made_tracks import CAMERA, LENS, PHOTO_CAMERA, T_DEPTH_PHOTO, aside, covere
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_source
-from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, cylinder
 from stereovox.track.photos import Beside, inverse_depths
 from stereovox.track.sightings import Corners, Sightings

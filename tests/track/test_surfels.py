@@ -8,7 +8,7 @@ import pytest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.frame import DepthImage
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.track import _surfels
 from stereovox.track.surfels import FIRST, Patches, Surfels, patches_of
 

@@ -10,7 +10,7 @@ import pytest
 from made_tracks import STEP_NS, aside, covered, hall, seen, simulated, track, tracker
 
 from stereovox.errors import StereovoxError
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, box, cylinder
 from stereovox.track.fit import Fit, Limits
 from stereovox.track.surfaces import Surfaces

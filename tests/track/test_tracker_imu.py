@@ -9,7 +9,7 @@ import pytest
 from made_imu import SIDEWAYS, both, cluttered, imu_along, looking_round, tracker_with
 from made_tracks import STEP_NS, covered, seen, simulated, track
 
-from stereovox.se3 import inverse, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import inverse, rotation_matrix, rotation_vector
 from stereovox.sources.imu import ImuReadings
 from stereovox.track.tracker import LEVEL, Tracker
 

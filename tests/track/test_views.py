@@ -6,7 +6,7 @@ import pytest
 from made_tracks import CAMERA, SUBPIXEL, aside, hall, seen, simulated
 
 from stereovox.frame import DepthImage
-from stereovox.se3 import look_at, rotation_matrix
+from stereovox.geometry.se3 import look_at, rotation_matrix
 from stereovox.simulate.scene import Scene, box
 from stereovox.track.surfaces import LOOKED_THROUGH, MIN_PATCHES
 from stereovox.track.surfels import patches_of

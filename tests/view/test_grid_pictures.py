@@ -11,13 +11,12 @@ from made_pages import Balanced
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grid_lattice import lay
-from stereovox.evaluate.grid_scores import Difference, differences, laid_on, score_laid, wrong
+from stereovox.evaluate.grids.grid_lattice import lay
+from stereovox.evaluate.grids.grid_scores import Difference, differences, laid_on, score_laid, wrong
+from stereovox.geometry import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.report.grid import write_grid_report
 from stereovox.view.grid import draw_grid, picture_grid, pooled, trimmed
 from stereovox.view.grid_difference import (
     BOTH_FREE,
@@ -30,6 +29,7 @@ from stereovox.view.grid_difference import (
     side_by_side_png,
 )
 from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS
+from stereovox.view.report.grid import write_grid_report
 
 
 def colours_at(figure, axis, points):

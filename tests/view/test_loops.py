@@ -9,11 +9,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 
 import stereovox as sv
-from stereovox.closing import LoopClosure
+from stereovox.correct.close_loops import LoopClosure
+from stereovox.correct.loops.closer import Loop
+from stereovox.correct.loops.matching import Match
 from stereovox.errors import StereovoxError
-from stereovox.loops.closer import Loop
-from stereovox.loops.matching import Match
-from stereovox.rebuild import CORRECTED, CorrectionReport
+from stereovox.mapping.rebuild import CORRECTED, CorrectionReport
 from stereovox.view.loops import AFTER, BEFORE, CLOSED, LISTED, REFUSED, WINDOW_M, loops_figure, loops_picture
 
 FRAMES, ANCHORS = 41, np.arange(0, 41, 5)

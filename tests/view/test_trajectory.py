@@ -11,8 +11,8 @@ from matplotlib.image import imread
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory_motions import travelled_m
-from stereovox.sources.poses import Poses
+from stereovox.evaluate.trajectory.trajectory_motions import travelled_m
+from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.view.figures import png_of
 from stereovox.view.trajectory import LOST, score_figure, trajectory_png, way_figure

@@ -8,19 +8,19 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
+from stereovox.geometry.se3 import rigidity_error
 from stereovox.maps import VoxelMap, load_map
-from stereovox.se3 import rigidity_error
-from stereovox.view.drawn import UPS, upright
 from stereovox.view.figures import save
-from stereovox.view.landscape import FROM, columns, thinned
-from stereovox.view.layer import upright_layer
 from stereovox.view.panels import PATH_COLOUR
-from stereovox.view.render import render
-from stereovox.view.scale import scale_of
-from stereovox.view.shading import Occlusion
-from stereovox.view.space import numbers
-from stereovox.view.viewpoint import field_of_view, viewpoint_at
-from stereovox.view.views import VIEWS, draw_view
+from stereovox.view.scene.drawn import UPS, upright
+from stereovox.view.scene.landscape import FROM, columns, thinned
+from stereovox.view.scene.layer import upright_layer
+from stereovox.view.scene.render import render
+from stereovox.view.scene.scale import scale_of
+from stereovox.view.scene.shading import Occlusion
+from stereovox.view.scene.space import numbers
+from stereovox.view.scene.viewpoint import field_of_view, viewpoint_at
+from stereovox.view.scene.views import VIEWS, draw_view
 
 CAMERA = PinholeCamera.from_field_of_view(100, 60, 90, 0.05)
 

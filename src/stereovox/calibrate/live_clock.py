@@ -20,9 +20,9 @@ from stereovox.calibrate.tracker import PoseTrack
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, Cloud, Scan, name_of
-from stereovox.se3 import Transform, apart
-from stereovox.sources.clock_watch import CLOCK, LATE, START_NS, ClockDoubt, ClockWatch, Delays, Heard
-from stereovox.sources.poses import Poses
+from stereovox.geometry.se3 import Transform, apart
+from stereovox.sources.poses.clock_watch import CLOCK, LATE, START_NS, ClockDoubt, ClockWatch, Delays, Heard
+from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracker
 
 REASON = "clock_doubt"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MissingExtra
-from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
 
 PLANE_REACH = 0.12
 """Metres; points further apart do not belong together."""

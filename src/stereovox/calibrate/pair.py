@@ -30,9 +30,9 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason
+from stereovox.geometry.se3 import Transform
 from stereovox.opening import DepthSource
-from stereovox.se3 import Transform
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 MIN_TURN = np.radians(3.0)
 """Fewest radians, root mean square, that the camera must turn between registered images."""

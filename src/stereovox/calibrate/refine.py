@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.odometry import CameraMotion
 from stereovox.calibrate.tracker import PoseTrack
-from stereovox.se3 import Transform, rotation_matrix
+from stereovox.geometry.se3 import Transform, rotation_matrix
 
 BLOCKS = 10
 """Parts of the recording that are left out in turn, at most, to see how much the result depends on each."""

@@ -16,7 +16,7 @@ from stereovox.calibrate.stereo_fit import Fit, fit_stereo, missed_pixels, refin
 from stereovox.cameras.lenses import MODELS, Lens
 from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
 
 MIN_PAIRS = 3
 """Fewest usable image pairs."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 FULL_MODEL_VIEWS = 10
 """Views from which on a fifth Brown-Conrady coefficient is fitted; with fewer it only follows noise."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.odometry import CameraMotion
 from stereovox.errors import StereovoxError
-from stereovox.sources.poses import MAX_GAP_NS, Poses
-from stereovox.sources.tracker import angles, jumps
+from stereovox.sources.poses.poses import MAX_GAP_NS, Poses
+from stereovox.sources.poses.tracker import angles, jumps
 
 SMOOTH = 0.03
 """Seconds; a hand that swings twice a second loses 0.6 % of its turns by that."""

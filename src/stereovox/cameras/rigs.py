@@ -13,7 +13,7 @@ from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.errors import StereovoxError, did_you_mean
-from stereovox.se3 import Transform, orthonormalise, rigidity_error
+from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error
 
 VirtualCamera = PinholeCamera | SphericalCamera | CylindricalCamera
 """The camera of a rectified image."""

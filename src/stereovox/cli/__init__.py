@@ -22,46 +22,24 @@ from typing import Any, NoReturn
 import stereovox
 from stereovox.errors import StereovoxError, did_you_mean, one_line, printed
 
-COMMANDS = (
-    "demo",
-    "map",
-    "live",
-    "fleet",
-    "info",
-    "picture",
-    "view",
-    "sphere",
-    "export",
-    "import",
-    "distance",
-    "path",
-    "crop",
-    "merge",
-    "loops",
-    "remap",
-    "diff",
-    "coarsen",
-    "frontiers",
-    "ground",
-    "grid",
-    "slam",
-    "localize",
-    "track",
-    "simulate",
-    "explore",
-    "ros2",
-    "bench",
-    "benchmark",
-    "calibrate",
-    "truth",
-    "eval",
-    "score",
-    "reproduce",
-)
-"""Each is a module of this package with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`.
+GROUPS = {
+    "Start": ("start", ("demo", "info", "simulate")),
+    "Map": ("map", ("map", "live", "fleet", "track", "slam", "localize", "import")),
+    "Look": ("look", ("picture", "view", "sphere", "export")),
+    "Ask": ("ask", ("distance", "path", "frontiers", "ground", "grid", "diff")),
+    "Correct": ("correct", ("merge", "loops", "remap", "crop", "coarsen", "calibrate")),
+    "Robots": ("robots", ("ros2",)),
+    "Prove": ("prove", ("eval", "score", "truth")),
+}
+"""Groups of the help: the folder of their commands, and the commands.
 
-The module of a command that is a Python keyword has a trailing underscore.
+Each command is a module with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`; it may name
+its `GROUP`. The module of a command that is a Python keyword has a trailing underscore. Other packages add commands as
+entry points `name = "module"` of the group `stereovox.commands`.
 """
+COMMANDS = {name: f"stereovox.cli.{folder}.{name}" for folder, names in GROUPS.values() for name in names}
+COMMANDS |= {"import": "stereovox.cli.map.import_", "calibrate": "stereovox.cli.calibrate"}
+"""Module of each built-in command."""
 
 DOUBTED = 3
 """Exit status of a command that wrote a map which may be wrong, or a trajectory with gaps."""

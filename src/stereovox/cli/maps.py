@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.terminal import but_few, cells_line, command_line, say
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.safe_io import FLOOR_READABLE, check_in_space
+from stereovox.files.safe_io import FLOOR_READABLE, check_in_space
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
@@ -24,7 +24,7 @@ Doubts = Sequence[dict[str, Any]]
 
 def check_new(out: str, *inputs: str) -> None:
     """Raise StereovoxError where no map can be saved to `out`, or it would overwrite one of its `inputs`."""
-    from stereovox.maps.store import check_target
+    from stereovox.maps.files.store import check_target
 
     if os.path.realpath(out) in map(os.path.realpath, inputs):
         raise StereovoxError(f"{out}: is what the new map is made of; give the new one another name")
@@ -103,7 +103,7 @@ def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None
 
 def open_cubes(path: str) -> VoxelMap:
     """Load the map at `path` with cubic cells; raises MapFileError as `open_map`."""
-    from stereovox.maps.cubes import in_cubes
+    from stereovox.maps.storage.cubes import in_cubes
 
     return in_cubes(open_map(path))
 
@@ -118,14 +118,14 @@ def open_map(path: str) -> VoxelMap:
 
 def check_there(path: str) -> None:
     """Raise MapFileError where `path` is no map: one line that suggests the map or recording likely meant."""
-    from stereovox.maps.store import is_map
+    from stereovox.maps.files.store import is_map
 
     if not is_map(path):
         raise MapFileError(f"{path}: {_what_is_there(Path(path))}")
 
 
 def _what_is_there(path: Path) -> str:
-    from stereovox.maps.store import is_map
+    from stereovox.maps.files.store import is_map
     from stereovox.opening import is_recording
 
     if not os.path.exists(path):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
-    from stereovox.se3 import Transform
+    from stereovox.geometry.se3 import Transform
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 """Syntax of a box: its lowest and its highest corner."""
@@ -52,9 +52,9 @@ def transform_of(text: str) -> Transform:
     """
     import numpy as np
 
+    from stereovox.files.safe_io import read_text
+    from stereovox.geometry.se3 import from_quaternion
     from stereovox.products.moved import rigid
-    from stereovox.safe_io import read_text
-    from stereovox.se3 import from_quaternion
 
     where = f"--transform {text}"
     try:

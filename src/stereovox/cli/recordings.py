@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from stereovox.cli.terminal import say, tracked
 from stereovox.errors import StereovoxError
-from stereovox.safe_io import check_folder
+from stereovox.files.safe_io import check_folder
 
 if TYPE_CHECKING:
     from stereovox.calibrate.recording import WallRecording
@@ -80,7 +80,7 @@ def _read(
     from stereovox.config import load_config
     from stereovox.depth import DepthPipeline
     from stereovox.opening import open_images, parse_slice
-    from stereovox.sources.camera_file import with_camera
+    from stereovox.sources.calibration.camera_file import with_camera
 
     stream: Stream = open_images(name, frames)
     if camera is not None:

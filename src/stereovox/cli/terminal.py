@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.contents.description import command_line as command_line
-from stereovox.contents.description import size as size
-from stereovox.contents.description import thousands as thousands
+from stereovox.descriptions.description import command_line as command_line
+from stereovox.descriptions.description import size as size
+from stereovox.descriptions.description import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def say_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def say_about_compiling() -> bool:
     """Explain why the first run on a machine takes longer; return whether this is one."""
-    from stereovox._jit import cache_folder
+    from stereovox.kernels._jit import cache_folder
 
     folder = cache_folder()
     if folder is None:

@@ -21,7 +21,7 @@ from stereovox.config.maps import MapConfig, ProjectiveConfig, RayConfig, Sensor
 from stereovox.config.robot import AmclConfig, GridConfig, LoopsConfig, ScanConfig, SlamConfig
 from stereovox.config.safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
-from stereovox.safe_io import read_text, shown, toml_table
+from stereovox.files.safe_io import read_text, shown, toml_table
 
 MAX_CELLS = 8192
 """Most cells between the camera and the maximum range."""

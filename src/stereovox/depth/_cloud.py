@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import kernel
+from stereovox.kernels._jit import kernel
 
 
 @kernel

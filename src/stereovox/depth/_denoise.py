@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 FAR = np.float32(np.inf)
 ZERO, ONE = np.float32(0), np.float32(1)

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 VALID, UNMATCHED, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3)
 MASKED, UNKNOWN = np.uint8(4), np.uint8(5)

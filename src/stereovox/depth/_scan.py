@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
 from stereovox.depth.sphere._sphere import _arctan2
+from stereovox.kernels._jit import cell, kernel
 
 VALID, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(2), np.uint8(3)
 ZERO, HALF, TINY, INF = np.float32(0), np.float32(0.5), np.float32(1e-12), np.float32(np.inf)

@@ -15,9 +15,9 @@ from stereovox.depth._cloud import usable
 from stereovox.depth.quality import check_cloud, check_unit_of_rays
 from stereovox.errors import FrameRefused
 from stereovox.frame import MAX_POINTS, CheckedCloud, Cloud, name_of
-from stereovox.se3 import Transform, inverse
+from stereovox.frame.validate import rigid_pose, validate_fields
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sensors.model import REACH_SIGMA
-from stereovox.trust.validate import rigid_pose, validate_fields
 
 SOME = 4096
 """Points of a cloud by which its unit is checked."""

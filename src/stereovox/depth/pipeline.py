@@ -12,7 +12,7 @@ from stereovox.depth.sphere.image import through_sphere
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Cloud, DepthImage, Frame, StereoFrame, name_of
-from stereovox.trust.validate import validate_fields
+from stereovox.frame.validate import validate_fields
 
 
 class DepthPipeline:

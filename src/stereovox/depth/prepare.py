@@ -19,8 +19,8 @@ from stereovox.depth import _denoise, _images
 from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason, name_of
+from stereovox.frame.validate import for_kernels, rigid_pose, validate_fields
 from stereovox.sensors.noise import RangeNoise
-from stereovox.trust.validate import for_kernels, rigid_pose, validate_fields
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535

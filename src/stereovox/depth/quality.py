@@ -18,8 +18,8 @@ from stereovox.config import Config
 from stereovox.depth import _cloud, _images
 from stereovox.errors import FrameRefused
 from stereovox.frame import CheckedCloud, Cloud, DepthImage, Frame, Reason, Scan, StereoFrame, name_of
+from stereovox.frame.validate import validate_upright_scan
 from stereovox.sensors.noise import RangeNoise
-from stereovox.trust.validate import validate_upright_scan
 
 ROWS = 16
 """Rows of an image that are sampled."""

@@ -15,7 +15,7 @@ from stereovox.config import Config
 from stereovox.depth import _scan
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import DepthImage, Reason, Scan
-from stereovox.se2 import lifted
+from stereovox.geometry.se2 import lifted
 
 STEEPEST_DEG = 80.0
 """Steeper rays have no usable direction on the floor and are ignored."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from stereovox.errors import MapFileError, SourceError
 from stereovox.evaluate.distance import distances
 from stereovox.evaluate.truth_cells import TruthCells
+from stereovox.files.safe_io import MAX_LIST, read_text
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.store import is_map
-from stereovox.safe_io import MAX_LIST, read_text
+from stereovox.maps.files.store import is_map
 
 COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
 """Columns of x, y, z by the numbers in a line: x y z; TUM, with or without a confidence; 3x4 and 4x4 matrices."""

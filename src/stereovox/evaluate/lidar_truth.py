@@ -17,13 +17,13 @@ from stereovox.depth.quality import check_unit_of_rays
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.evaluate.cells import indices, keys
 from stereovox.frame import Cloud, Viewpoint
+from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.integrate.crossing import crossed_cells
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import SIDE, BlockPool
+from stereovox.maps.record.history import History
+from stereovox.maps.storage.blocks import SIDE, BlockPool
 from stereovox.opening import parse_slice
-from stereovox.se3 import inverse, transform_points
 from stereovox.sources.lidar import Box, LidarScan, LidarSource
-from stereovox.trust.history import History
 
 Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 """Corner p0 of a box and its three neighbours p1, p3, p4 along the edges; (3,) each."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.lidar_truth import project
 from stereovox.evaluate.truth_cells import TruthCells
+from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.maps import VoxelMap
-from stereovox.se3 import Transform, inverse, transform_points
 
 MOST_PLACES = 100
 """Places that are tried; of a longer path evenly chosen ones stand for all."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.cells import Keys, keys, position
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 
 
 class Sightings:

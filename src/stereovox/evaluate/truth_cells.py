@@ -16,7 +16,7 @@ from stereovox.errors import StereovoxError
 from stereovox.evaluate.cells import Keys, indices, keys, position
 from stereovox.evaluate.metrics import known_cells
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cubes import in_cubes
+from stereovox.maps.storage.cubes import in_cubes
 
 _STEPS: tuple[int, ...] = tuple((keys(np.eye(3, dtype=int)) - keys([0, 0, 0])).tolist())
 """Difference of keys by one cell along x, y and z."""

@@ -10,17 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.deadline import Levels
+from stereovox.files.places import Place
+from stereovox.files.safe_io import sealed, unsealed
 from stereovox.fleet.recordings import digest, frames_of, read_frame
+from stereovox.mapping.deadline import Levels
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import CELLS
-from stereovox.maps.boxed_manifest import read_boxed_manifest
-from stereovox.maps.boxes import BOXES, BoxEntry, BoxLayout, Index, is_there, write_box
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.pyramid import coarser_layout, families, names_of
-from stereovox.maps.store import MANIFEST
-from stereovox.places import Place
-from stereovox.safe_io import sealed, unsealed
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.cells.pyramid import coarser_layout, families, names_of
+from stereovox.maps.files.boxed_manifest import read_boxed_manifest
+from stereovox.maps.files.store import MANIFEST
+from stereovox.maps.storage.blocks import CELLS
+from stereovox.maps.storage.boxes import BOXES, BoxEntry, BoxLayout, Index, is_there, write_box
 
 DONE = "done"
 """Folder of the entries of boxes that no manifest names yet, by what they are made of."""

@@ -15,6 +15,8 @@ from typing import Any
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.evaluate.summary import mostly_lost
+from stereovox.files.places import Place
+from stereovox.files.safe_io import sealed, unsealed
 from stereovox.fleet.boxes import DONE, Box, BoxesBefore, DoneBox, boxes_of, map_box
 from stereovox.fleet.cluster import Cluster, cluster
 from stereovox.fleet.recordings import (
@@ -31,24 +33,22 @@ from stereovox.fleet.recordings import (
     recordings_of,
     report_of,
 )
-from stereovox.maps.boxed_manifest import (
+from stereovox.maps.boxed_map import USUAL_SIDE, BoxedMap, check_boxed_target, side_of
+from stereovox.maps.cells.pyramid import coarser_layout, families, is_top, names_of, write_parent
+from stereovox.maps.files.boxed_manifest import (
     BoxedManifest,
     only_writer_at,
     read_boxed_manifest,
     sweep_boxes,
     write_boxed_manifest,
 )
-from stereovox.maps.boxed_map import USUAL_SIDE, BoxedMap, check_boxed_target, side_of
-from stereovox.maps.boxes import MAX_SIDE, BoxEntry, BoxLayout
-from stereovox.maps.pyramid import coarser_layout, families, is_top, names_of, write_parent
-from stereovox.maps.store import MANIFEST, viewpoint_from
+from stereovox.maps.files.store import MANIFEST, viewpoint_from
+from stereovox.maps.record.history import History
+from stereovox.maps.storage.boxes import MAX_SIDE, BoxEntry, BoxLayout
 from stereovox.opening import open_source
-from stereovox.places import Place
 from stereovox.products.merge import together
-from stereovox.run import SURVEYED, ended_in_order
-from stereovox.safe_io import sealed, unsealed
-from stereovox.survey import PICTURES_UPRIGHT, survey
-from stereovox.trust.history import History
+from stereovox.runs.recording import SURVEYED, ended_in_order
+from stereovox.runs.survey import PICTURES_UPRIGHT, survey
 
 MAX_SETTINGS = 1 << 20
 MAX_BOXES = 250_000

@@ -17,9 +17,9 @@ from stereovox.errors import StereovoxError
 from stereovox.fleet.fleet import box_side, settings_for
 from stereovox.fleet.recordings import COPY, POSES, Recording, Recordings, boxes_with, local, recordings_of, why_not
 from stereovox.mapper import Mapper
-from stereovox.maps.boxes import BoxLayout
+from stereovox.maps.storage.boxes import BoxLayout
 from stereovox.opening import open_source
-from stereovox.sources.trajectory import Trajectory
+from stereovox.sources.poses.trajectory import Trajectory
 
 LOOKED_AT = 24
 """Frames of a recording that are looked at, spread over it; the first of all compiles and does not count."""

@@ -26,20 +26,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
+from stereovox.correct.remap import remap
 from stereovox.errors import MapFileError, StereovoxError, one_line
+from stereovox.files.places import Bucket, Folder, NoBucketError, Place, is_url
+from stereovox.files.safe_io import sealed, unsealed
 from stereovox.frame import Cloud, Frame
 from stereovox.maps import VoxelMap
-from stereovox.maps.boxes import BoxLayout
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
-from stereovox.maps.kept_frames import KeptFrame, digest_of
-from stereovox.maps.store import MANIFEST, MAX_MANIFEST, is_map
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.files.store import MANIFEST, MAX_MANIFEST, is_map
+from stereovox.maps.record.frame_store import IN_A_PACK, files_of_frames, read_frames
+from stereovox.maps.record.kept_frames import KeptFrame, digest_of
+from stereovox.maps.storage.boxes import BoxLayout
 from stereovox.opening import is_recording
-from stereovox.places import Bucket, Folder, NoBucketError, Place, is_url
-from stereovox.pose_choice import GIVEN
-from stereovox.remapping import remap
-from stereovox.run import MapRun
-from stereovox.safe_io import sealed, unsealed
+from stereovox.runs.pose_choice import GIVEN
+from stereovox.runs.recording import MapRun
 from stereovox.sources.bags.recording import file_part
 
 VERSION = 2

@@ -19,16 +19,16 @@ from stereovox.evaluate.lidar_truth import FREE, lidar_truth
 from stereovox.evaluate.metrics import Confusion
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells, level
+from stereovox.files.places import Place
+from stereovox.files.safe_io import sealed, unsealed
 from stereovox.fleet.cluster import cluster
 from stereovox.fleet.fleet import Progress, suggested
 from stereovox.fleet.recordings import COPY, Recording, Recordings, digest, fingerprint, local, recordings_of, why_not
-from stereovox.maps.boxed_manifest import only_writer_at
-from stereovox.maps.store import MANIFEST
+from stereovox.maps.files.boxed_manifest import only_writer_at
+from stereovox.maps.files.store import MANIFEST
 from stereovox.opening import open_source
-from stereovox.places import Place
-from stereovox.pose_choice import GIVEN
-from stereovox.run import MapRun, ended_in_order
-from stereovox.safe_io import sealed, unsealed
+from stereovox.runs.pose_choice import GIVEN
+from stereovox.runs.recording import MapRun, ended_in_order
 
 VERSION = 2
 """Of what is kept of a score; another one is made anew."""

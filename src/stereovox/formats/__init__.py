@@ -13,10 +13,10 @@ from stereovox import registry
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.formats.octomap import read_octomap
 from stereovox.maps import VoxelMap
-from stereovox.maps.cubes import in_cubes
-from stereovox.maps.store import is_map
-from stereovox.products.floor_heights import FloorHeights
-from stereovox.trust.history import Imported
+from stereovox.maps.files.store import is_map
+from stereovox.maps.record.history import Imported
+from stereovox.maps.storage.cubes import in_cubes
+from stereovox.products.floor.floor_heights import FloorHeights
 
 CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".bin", ".stl", ".obj", ".off")
 """Endings of point clouds and meshes."""

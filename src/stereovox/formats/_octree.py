@@ -7,7 +7,7 @@ last first, so that they are popped in file order; a stack never holds more than
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, kernel
+from stereovox.kernels._jit import allocating_kernel, kernel
 
 HEIGHT = 16
 STACK = 8 * HEIGHT

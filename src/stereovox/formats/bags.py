@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
 from stereovox.formats.clouds import PointFile, map_of_cloud
 from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_of_nodes
+from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor_axes import upright_axes
-from stereovox.products.floor_heights import FloorHeights, floor_of_map
-from stereovox.products.projection import Heights, project
+from stereovox.products.floor.floor_axes import upright_axes
+from stereovox.products.floor.floor_heights import FloorHeights, floor_of_map
+from stereovox.products.floor.projection import Heights, project
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import (
@@ -29,7 +30,6 @@ from stereovox.sources.bags.robot_messages import (
     read_point_cloud,
 )
 from stereovox.sources.bags.writer import BagWriter
-from stereovox.threads import one_state
 
 MAP_FRAME, CELLS_FRAME = "map", "map_cells"
 """Names of the frame whose z is up, and of that of the cells where another axis is up in it."""

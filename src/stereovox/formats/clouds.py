@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.files.safe_io import read_bounded
 from stereovox.formats.cell_size import SuggestedCell, extents, suggested_cell, suggested_for_mesh
 from stereovox.formats.las import read_las
 from stereovox.formats.read_points import cells_of_points
 from stereovox.formats.text_points import read_text_points
 from stereovox.maps import VoxelMap
-from stereovox.safe_io import read_bounded
+from stereovox.maps.record.history import Imported
 from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.point_files import MAX_BYTES, read_points
-from stereovox.trust.history import Imported
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937}
 """Metres of each unit that `--unit` knows."""

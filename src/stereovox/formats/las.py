@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, MissingExtra
-from stereovox.safe_io import read_bounded
+from stereovox.files.safe_io import read_bounded
 
 MAX_BYTES = 1 << 32
 MAX_POINTS = 1 << 28

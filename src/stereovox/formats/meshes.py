@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, MissingExtra, StereovoxError
+from stereovox.files.safe_io import replacing
 from stereovox.formats.points import height_colours
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.blocks import SIDE
-from stereovox.maps.cell_format import CellRules
-from stereovox.products.floor_axes import upright_axes
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.storage.blocks import SIDE
+from stereovox.products.floor.floor_axes import upright_axes
 from stereovox.products.side_by_side import cells_at, in_memory
-from stereovox.safe_io import replacing
-from stereovox.threads import one_state
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError
+from stereovox.files.safe_io import read_bounded, replacing
 from stereovox.formats import _octree
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.evidence import Evidence, to_units
-from stereovox.safe_io import read_bounded, replacing
-from stereovox.threads import one_state
-from stereovox.trust.history import Imported
+from stereovox.maps.cells.evidence import Evidence, to_units
+from stereovox.maps.record.history import Imported
 
 DEPTH = 16
 """Levels below the root; a cell of the finest level has a 16-bit key on each axis."""

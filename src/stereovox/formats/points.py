@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.files.safe_io import replacing
+from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
-from stereovox.products.floor_axes import heights_of
-from stereovox.safe_io import replacing
-from stereovox.threads import one_state
+from stereovox.products.floor.floor_axes import heights_of
 
 PLY_POINT = np.dtype(
     [

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.formats.octomap import OCTOMAP
 from stereovox.formats.read_points import check_room
+from stereovox.geometry import se2
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor_axes import checked_heights
-from stereovox.trust.history import Imported
+from stereovox.maps.record.history import Imported
+from stereovox.products.floor.floor_axes import checked_heights
 
 WITHIN = (1 / 6, 1 / 2, 5 / 6)
 """Places in a cell, as shares of its side, that are looked up in the floor's map."""

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.files.safe_io import json_value, read_arrays
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import blocks_of_cells
-from stereovox.maps.queries import INDEX_LIMIT
-from stereovox.safe_io import json_value, read_arrays
+from stereovox.maps.query.queries import INDEX_LIMIT
+from stereovox.maps.storage.blocks import blocks_of_cells
 
 MAX_BLOCKS = 2**19
 """Most blocks of 8x8x8 cells, 1 KB each, so that a file of far-apart points cannot fill the memory."""

@@ -18,13 +18,13 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth import DepthPipeline
 from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import FrameRefused, MissingExtra
+from stereovox.files.safe_io import replacing
 from stereovox.formats.points import cell_colours
 from stereovox.frame import AnyFrame, CheckedCloud, Cloud, DepthImage
+from stereovox.geometry.se3 import Transform
+from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
-from stereovox.maps.cubes import in_cubes
-from stereovox.safe_io import replacing
-from stereovox.se3 import Transform
-from stereovox.threads import one_state
+from stereovox.maps.storage.cubes import in_cubes
 
 CAMERA, CELLS, PATH, CLOUD = "world/camera", "world/occupied", "world/path", "world/cloud"
 TIME = "stamp"

@@ -19,14 +19,14 @@ from stereovox.cameras.lidar import Lidar
 from stereovox.config import load_config
 from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.files.safe_io import read_bounded, shown
 from stereovox.formats.cell_size import suggested_cell
 from stereovox.formats.read_points import MAX_BLOCKS
 from stereovox.frame import Cloud
+from stereovox.geometry.se3 import Transform, from_quaternion, transform_points
 from stereovox.integrate.crossing import scan_evidence
 from stereovox.maps import VoxelMap
-from stereovox.safe_io import read_bounded, shown
-from stereovox.se3 import Transform, from_quaternion, transform_points
-from stereovox.trust.history import Imported
+from stereovox.maps.record.history import Imported
 
 MAX_BYTES = 1 << 32
 POINT = np.dtype([("size", "<i4"), ("xyz", "<f8", 3)])

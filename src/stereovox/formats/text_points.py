@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError
-from stereovox.safe_io import read_text, shown
+from stereovox.files.safe_io import read_text, shown
 
 MAX_BYTES = 1 << 30
 HEAD = 1 << 16

@@ -10,7 +10,7 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyImage, DepthImage
 from stereovox.integrate.views import check_place
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
 
 if TYPE_CHECKING:
     from stereovox.integrate.points import Points

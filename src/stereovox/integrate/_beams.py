@@ -7,7 +7,7 @@ origin cells keep their edges. Places are in cells, whole multiples of 2^-20, so
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell, kernel
+from stereovox.kernels._jit import allocating_kernel, cell, kernel
 
 UNSIGNED = np.uint64
 """Kind of index without the test for negative indices."""

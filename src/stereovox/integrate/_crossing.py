@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel
+from stereovox.kernels._jit import allocating_kernel
 
 
 @allocating_kernel

@@ -8,14 +8,14 @@ the end, makes room, and does the frame again. The order of lists differs from r
 
 import numpy as np
 
-from stereovox._gpu import cuda, gpu_kernel, on_gpu
 from stereovox.integrate import _cells, _hits, _projective, _windows
 from stereovox.integrate._cells import HALF, NARROW, NEAR_PLANE, NO_RETURN, ONE, WIDE, ZERO
 from stereovox.integrate._hits import NOTHING
 from stereovox.integrate._projective import COARSE, FREE, MIXED
 from stereovox.integrate._windows import COARSEST
-from stereovox.maps import _cells as _map_cells
-from stereovox.maps._cells import EMPTY
+from stereovox.kernels._gpu import cuda, gpu_kernel, on_gpu
+from stereovox.maps.cells import _cells as _map_cells
+from stereovox.maps.cells._cells import EMPTY
 
 LARGE, MIDDLE, SEEN_FREE, SEEN_MIXED, FREE_BLOCKS, LISTED, HIT_BLOCKS = 0, 1, 2, 3, 4, 5, 6
 """Places in `counts` (COUNTS,) int32: mixed boxes of four and of two blocks, free and mixed blocks of the view, free

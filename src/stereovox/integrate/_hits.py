@@ -7,8 +7,6 @@ pixels whose number differs from their neighbours' go on; groups without any cos
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
-from stereovox._math import floor, square_root
 from stereovox.integrate._cells import (
     HALF,
     NARROW,
@@ -22,7 +20,9 @@ from stereovox.integrate._cells import (
     table_row,
     unpack,
 )
-from stereovox.maps._cells import find_or_insert
+from stereovox.kernels._jit import cell, kernel
+from stereovox.kernels._math import floor, square_root
+from stereovox.maps.cells._cells import find_or_insert
 
 SEEN_BITS = 11
 SEEN = 1 << SEEN_BITS

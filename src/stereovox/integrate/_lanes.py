@@ -7,7 +7,6 @@ the compiler vectorises over lanes. Then gains are summed in runs, since neighbo
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import (
     HALF,
     NO_RETURN,
@@ -23,7 +22,8 @@ from stereovox.integrate._cells import (
     usable,
 )
 from stereovox.integrate._hits import _point_cell
-from stereovox.maps._cells import find_or_insert
+from stereovox.kernels._jit import cell, kernel
+from stereovox.maps.cells._cells import find_or_insert
 
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""

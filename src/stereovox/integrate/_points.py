@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
-from stereovox._math import floor
 from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of, pack, table_row
 from stereovox.integrate._lanes import HALF_DIAGONAL, LANES, _sign, even_to
 from stereovox.integrate._ray import _inverse, first_cell, walk
+from stereovox.kernels._jit import cell, kernel
+from stereovox.kernels._math import floor
 
 
 @kernel

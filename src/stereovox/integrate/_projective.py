@@ -7,11 +7,11 @@ classified by two comparisons, and only a layer with cells near a measurement is
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
-from stereovox._math import floor
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
 from stereovox.integrate._windows import COARSEST, build, nearest_tiles, place
-from stereovox.maps._cells import find
+from stereovox.kernels._jit import cell, kernel
+from stereovox.kernels._math import floor
+from stereovox.maps.cells._cells import find
 
 SKIP, FREE, MIXED = 0, 1, 2
 """Kinds of boxes; see `_classify`."""

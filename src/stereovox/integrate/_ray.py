@@ -7,7 +7,6 @@ cells that a ray only grazes.
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of, pack, strides
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._lanes import (
@@ -22,6 +21,7 @@ from stereovox.integrate._lanes import (
     give,
     in_step,
 )
+from stereovox.kernels._jit import cell, kernel
 
 OFF_FACE = np.float32(1e-3)
 """Distance in cells that samples keep from the faces of cells, where rounding would choose the cell."""

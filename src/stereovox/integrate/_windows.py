@@ -13,8 +13,8 @@ below that; so the place of a pixel takes a few sums and no table look-up (`plac
 
 import numpy as np
 
-from stereovox._jit import cell
 from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, float_of, usable
+from stereovox.kernels._jit import cell
 
 COARSEST = 8
 """The highest level."""

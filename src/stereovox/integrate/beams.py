@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import registry, se2
+from stereovox import registry
 from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan, name_of
+from stereovox.frame.validate import for_kernels
+from stereovox.geometry import se2
 from stereovox.integrate import _beams
-from stereovox.maps.evidence import CELLS, SIDE, GridEvidence, to_units
+from stereovox.maps.cells.evidence import CELLS, SIDE, GridEvidence, to_units
 from stereovox.maps.voxel_map import INDEX_LIMIT
-from stereovox.trust.validate import for_kernels
 
 TRAVERSALS = {
     "bresenham": "stereovox.integrate._beams:bresenham",

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.integrate import _crossing
-from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.blocks import CELLS, SIDE, blocks_of_cells
 
 AT_ONCE = 1 << 22
 """Cells walked before those found twice are dropped."""

@@ -14,8 +14,8 @@ from stereovox.cameras.wide import SEEN_DEG, CylindricalCamera, SphericalCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Reason
+from stereovox.geometry.se3 import Transform
 from stereovox.integrate.views import check_view
-from stereovox.se3 import Transform
 
 WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))

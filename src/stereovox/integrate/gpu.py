@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox._gpu import gpu_array, launch, to_gpu
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
-from stereovox.device import check_device
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import DepthImage
 from stereovox.integrate import _gpu
 from stereovox.integrate.projective import ROOM, make_windows
 from stereovox.integrate.views import PerCamera, View, Views, check_blocks, check_view, sensor_table, uses_wide_keys
-from stereovox.maps.blocks import CELLS, table_size
-from stereovox.maps.gpu import GpuArrays, GpuEvidence
+from stereovox.kernels._gpu import gpu_array, launch, to_gpu
+from stereovox.kernels.device import check_device
+from stereovox.maps.storage.blocks import CELLS, table_size
+from stereovox.maps.storage.gpu import GpuArrays, GpuEvidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 

@@ -17,11 +17,11 @@ from stereovox.integrate import _cells, _lanes, _points
 from stereovox.integrate._lanes import LANES
 from stereovox.integrate.ray import make_lanes, make_memory, merged
 from stereovox.integrate.views import MAX_BLOCKS, KernelTable, PerCamera, origin_block, sensor_table
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
-from stereovox.maps.evidence import Evidence
+from stereovox.kernels.threads import in_shards
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.blocks import CELLS, SIDE, BlockPool
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards
 
 PLACES = 16
 """Places along a cell's side at which rays begin: those of a moving sensor are rounded to them."""

@@ -34,11 +34,11 @@ from stereovox.integrate.views import (
     sensor_table,
     uses_wide_keys,
 )
-from stereovox.maps.blocks import CELLS, BlockPool
-from stereovox.maps.evidence import Evidence
+from stereovox.kernels.threads import Scratch, in_shards, run_both, shards
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.blocks import CELLS, BlockPool
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import Scratch, in_shards, run_both, shards
 
 LEVELS = _windows.COARSEST + 1
 """Number of window sizes: one pixel, and three tiles of 1 to 128 pixels."""

@@ -31,11 +31,11 @@ from stereovox.integrate.views import (
     sensor_table,
     uses_wide_keys,
 )
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
-from stereovox.maps.evidence import Evidence
+from stereovox.kernels.threads import in_shards, shards
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.storage.blocks import CELLS, SIDE, BlockPool
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards, shards
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]

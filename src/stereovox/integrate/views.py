@@ -16,11 +16,11 @@ from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
+from stereovox.geometry.se3 import Transform
 from stereovox.integrate import _cells
-from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.evidence import to_units
-from stereovox.maps.queries import INDEX_LIMIT
-from stereovox.se3 import Transform
+from stereovox.maps.cells.evidence import to_units
+from stereovox.maps.query.queries import INDEX_LIMIT
+from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
 

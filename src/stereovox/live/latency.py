@@ -10,8 +10,8 @@ from typing import Any
 
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import UpdateReport
+from stereovox.frame.wall_clock import epoch_ns
 from stereovox.live.stream import Moment
-from stereovox.trust.wall_clock import epoch_ns
 
 STAMP, ARRIVAL = "stamp", "arrival"
 

@@ -19,16 +19,16 @@ from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import SphereGrid, SphereLayout, accumulate
 from stereovox.depth.sphere.vehicle import together
 from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.files.safe_io import FLOOR_ENDINGS, check_file
 from stereovox.formats.map_server import write_map_server
 from stereovox.frame import Cloud, UpdateReport
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.context import context_of
-from stereovox.products.floor_axes import Heights
-from stereovox.products.live_projection import LiveProjection
-from stereovox.safe_io import FLOOR_ENDINGS, check_file
-from stereovox.se3 import Transform, inverse
-from stereovox.sources.live_poses import LivePoses
+from stereovox.products.floor.floor_axes import Heights
+from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.sources.poses.live_poses import LivePoses
 
 GRID_S = 1.0
 """Seconds between two writes of the 2-D map."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from stereovox import registry
 from stereovox.errors import SourceError
-from stereovox.pose_choice import GIVEN, TRACK
-from stereovox.sources.pose_stream import PoseStream
+from stereovox.runs.pose_choice import GIVEN, TRACK
+from stereovox.sources.poses.pose_stream import PoseStream
 
 POSES = {
-    "udp": "stereovox.sources.pose_stream:UdpPoses",
-    "tcp": "stereovox.sources.pose_stream:TcpPoses",
-    "t265": "stereovox.sources.pose_stream:T265",
+    "udp": "stereovox.sources.poses.pose_stream:UdpPoses",
+    "tcp": "stereovox.sources.poses.pose_stream:TcpPoses",
+    "t265": "stereovox.sources.poses.pose_stream:T265",
     "mavlink": "stereovox.mavlink.stream:MavlinkPoses",
 }
 """Streams of poses (`PoseStream`), asked in this order, then entry points in the group `stereovox.poses`."""

@@ -18,7 +18,7 @@ import numpy as np
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame, UpdateReport
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.imu import Imu
 

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
-from stereovox.safe_io import is_number, read_table, shown
-from stereovox.se3 import Transform, from_quaternion, orthonormalise, rigidity_error
+from stereovox.files.safe_io import is_number, read_table, shown
+from stereovox.frame.validate import matrix_of
+from stereovox.geometry.se3 import Transform, from_quaternion, orthonormalise, rigidity_error
 from stereovox.sources.base import Stream
-from stereovox.trust.validate import matrix_of
 
 TOLERANCE = 5e-3
 """Largest entry of abs(R^T R - I) that passes for rounding."""

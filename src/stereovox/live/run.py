@@ -15,6 +15,7 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.summary import mostly_lost, summarise
 from stereovox.frame import UpdateReport
+from stereovox.geometry.se3 import inverse, orthonormalise
 from stereovox.live.latency import Latency
 from stereovox.live.outputs import GridFile, LiveSphere, Output
 from stereovox.live.poses import open_poses
@@ -25,14 +26,13 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.mavlink.sending import ObstacleSender
 from stereovox.mavlink.stream import MavlinkPoses
-from stereovox.pose_choice import GIVEN, TRACK
-from stereovox.products.floor_axes import Heights
-from stereovox.run import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
-from stereovox.se3 import inverse, orthonormalise
+from stereovox.products.floor.floor_axes import Heights
+from stereovox.runs.pose_choice import GIVEN, TRACK
+from stereovox.runs.recording import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
+from stereovox.runs.warm_up import warm_up
 from stereovox.sources.base import Stream
-from stereovox.sources.live_poses import LivePoses
-from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
-from stereovox.warm_up import warm_up
+from stereovox.sources.poses.live_poses import LivePoses
+from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
 
 Cameras = str | Path | Stream | LiveCamera | Sequence[str | Path | Stream | LiveCamera]
 PosesFrom = str | PoseStream | LivePoses | None

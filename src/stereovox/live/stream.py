@@ -21,22 +21,22 @@ from stereovox.calibrate.live_clock import CameraClock
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
+from stereovox.frame.wall_clock import epoch_ns
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera, open_images
-from stereovox.pose_choice import GIVEN, HOW, TRACK, has_poses
-from stereovox.se3 import Transform, inverse
+from stereovox.runs.pose_choice import GIVEN, HOW, TRACK, has_poses
+from stereovox.runs.survey import level_pose
 from stereovox.sources.base import Stream, imu_of
-from stereovox.sources.clock_watch import Delays, Heard
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
-from stereovox.sources.live_poses import LivePoses
 from stereovox.sources.paced import Paced
-from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
+from stereovox.sources.poses.clock_watch import Delays, Heard
+from stereovox.sources.poses.live_poses import LivePoses
+from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.sources.waiting import Arrival, Waiting
-from stereovox.survey import level_pose
 from stereovox.track.stream import follow
 from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
-from stereovox.trust.wall_clock import epoch_ns
 
 WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 2
 """Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer

@@ -9,14 +9,14 @@ from math import ceil
 
 import numpy as np
 
-from stereovox import se2
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
+from stereovox.frame.validate import validate_scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl.models import DistanceField, distance_field
 from stereovox.localize.scan_beams import beams_of
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.trust.validate import validate_scan
 
 NEAR = 0.25
 """Metres from an obstacle of the map within which a beam fits."""

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import MissingExtra, StereovoxError
+from stereovox.geometry.pose_graph import need_gtsam
 from stereovox.localize.amcl.localise import localise
 from stereovox.localize.fit import NEAR, fit_share
 from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.slam.pipeline import SlamResult, map_scans
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.pose_graph import need_gtsam
 from stereovox.sources.robots.robot import Robot
 
 Progress = Callable[[int, int, str], object]

@@ -10,10 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Scan
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.geometry import se2
+from stereovox.sources.poses.trajectory import write_trajectory
 
 Posed = TypeVar("Posed", bound=Frame | Scan)
 

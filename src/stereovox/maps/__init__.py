@@ -8,9 +8,9 @@ from pathlib import Path
 from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.maps.boxed_map import save_boxed
-from stereovox.maps.kept_frames import KeptFrames
-from stereovox.maps.loading import load_map
-from stereovox.maps.storage import Storage
+from stereovox.maps.files.loading import load_map
+from stereovox.maps.record.kept_frames import KeptFrames
+from stereovox.maps.storage.storage import Storage
 from stereovox.maps.voxel_map import State, VoxelMap, unbounded
 
 __all__ = ["State", "VoxelMap", "load_map", "make_map", "save_boxed", "unbounded"]
@@ -54,7 +54,7 @@ def _kept_frames(config: Config, resume: VoxelMap | None) -> KeptFrames | None:
 def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelMap:
     if config.window.size is None and (config.max_memory is None or config.when_full == "refuse"):
         return _without_window(config, resume)
-    from stereovox.maps.rolling import RollingMap
+    from stereovox.maps.storage.rolling import RollingMap
 
     rolling = RollingMap(config, tiles)
     if resume is not None:
@@ -68,12 +68,12 @@ def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelM
 
 def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
     if config.device == "cuda":
-        from stereovox.maps.gpu import gpu_map
+        from stereovox.maps.storage.gpu import gpu_map
 
         return gpu_map(config, resume)
     if config.max_memory is None:
         return VoxelMap(config) if resume is None else _continued(resume, config)
-    from stereovox.maps.capped import CappedMap
+    from stereovox.maps.cells.capped import CappedMap
 
     capped = CappedMap(config)
     if resume is not None:

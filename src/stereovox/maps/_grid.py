@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
-from stereovox.maps._cells import added, find, find_or_insert
+from stereovox.kernels._jit import cell, kernel
+from stereovox.maps.cells._cells import added, find, find_or_insert
 
 
 @kernel

@@ -11,24 +11,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.maps import queries
-from stereovox.maps.blocks import SIDE
-from stereovox.maps.boxed_manifest import (
+from stereovox.files.places import Place
+from stereovox.maps.cells.cell_format import State
+from stereovox.maps.cells.pyramid import write_levels
+from stereovox.maps.files.boxed_manifest import (
     BoxedManifest,
     bounds_of,
     only_writer_at,
     sweep_boxes,
     write_boxed_manifest,
 )
-from stereovox.maps.boxed_storage import CACHE_BYTES, BoxedStorage, Wanted, any_box
-from stereovox.maps.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, write_box
-from stereovox.maps.cell_format import State
-from stereovox.maps.lock import LOCK
-from stereovox.maps.pyramid import write_levels
-from stereovox.maps.queries import Asked, NearestCells, RayHits
-from stereovox.maps.store import MANIFEST
+from stereovox.maps.files.lock import LOCK
+from stereovox.maps.files.store import MANIFEST
+from stereovox.maps.query import queries
+from stereovox.maps.query.queries import Asked, NearestCells, RayHits
+from stereovox.maps.storage.blocks import SIDE
+from stereovox.maps.storage.boxed_storage import CACHE_BYTES, BoxedStorage, Wanted, any_box
+from stereovox.maps.storage.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, write_box
 from stereovox.maps.voxel_map import VoxelMap, unbounded
-from stereovox.places import Place
 
 USUAL_SIDE = 256
 """Cells along the side of a box where none is asked for."""

@@ -12,21 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, StereovoxError
-from stereovox.maps import _grid, _pool
-from stereovox.maps.blocks import BlockPool
-from stereovox.maps.cell_format import CellRules, State
-from stereovox.maps.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvidence
-from stereovox.maps.lock import only_writer_of
-from stereovox.maps.memory import format_bytes
+from stereovox.files.safe_io import read_arrays, replacing, sealed, unsealed
+from stereovox.geometry import se2
+from stereovox.kernels.threads import Guarded, MapLock
+from stereovox.maps import _grid
+from stereovox.maps.cells import _pool
+from stereovox.maps.cells.cell_format import CellRules, State
+from stereovox.maps.cells.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvidence
+from stereovox.maps.files.lock import only_writer_of
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
-from stereovox.maps.queries import INDEX_LIMIT, points_of, shape_error
-from stereovox.maps.storage import OnStorage
-from stereovox.safe_io import read_arrays, replacing, sealed, unsealed
-from stereovox.threads import Guarded, MapLock
-from stereovox.trust.history import History
+from stereovox.maps.query.queries import INDEX_LIMIT, points_of, shape_error
+from stereovox.maps.record.history import History
+from stereovox.maps.storage.blocks import BlockPool
+from stereovox.maps.storage.memory import format_bytes
+from stereovox.maps.storage.storage import OnStorage
 
 FORMAT, VERSION = "stereovox-grid", 2
 PARTS = ("about", "coords", "cells")

@@ -16,11 +16,11 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.maps.blocks import SIDE
-from stereovox.maps.cell_format import State
-from stereovox.maps.memory import format_bytes
+from stereovox.maps.cells.cell_format import State
+from stereovox.maps.record.history import History
+from stereovox.maps.storage.blocks import SIDE
+from stereovox.maps.storage.memory import format_bytes
 from stereovox.maps.upright import ceiling, turned, turned_cells
-from stereovox.trust.history import History
 
 SIZE_PX = 400
 """Longer side of a picture at most; smaller maps are enlarged by a whole factor."""

@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
-from stereovox.maps.cell_format import CellRules, State
-from stereovox.maps.queries import points_of, shape_error
+from stereovox.geometry import se2
+from stereovox.maps.cells.cell_format import CellRules, State
+from stereovox.maps.query.queries import points_of, shape_error
 
 UNKNOWN = -1
 

@@ -13,17 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.maps import queries
-from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells, span_of
-from stereovox.maps.cell_format import State as State
-from stereovox.maps.cell_times import NEVER
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.kept_frames import KeptFrames
-from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
-from stereovox.maps.queries import Asked, NearestCells, RayHits
-from stereovox.maps.storage import OnStorage, Storage
-from stereovox.maps.store import save_map
-from stereovox.threads import Guarded
+from stereovox.kernels.threads import Guarded
+from stereovox.maps.cells.cell_format import State as State
+from stereovox.maps.cells.cell_times import NEVER
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.files.store import save_map
+from stereovox.maps.query import queries
+from stereovox.maps.query.queries import INDEX_LIMIT as INDEX_LIMIT
+from stereovox.maps.query.queries import Asked, NearestCells, RayHits
+from stereovox.maps.record.kept_frames import KeptFrames
+from stereovox.maps.storage.blocks import CELLS, SIDE, blocks_of_cells, span_of
+from stereovox.maps.storage.storage import OnStorage, Storage
 
 IN_STORAGE = frozenset({"blocks_within", "insert", "slabs", "timed"})
 """Names of `Storage` that were once reached at the map itself, and still are."""

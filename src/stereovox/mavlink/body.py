@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereovox.se3 import Transform, apart, interpolate
-from stereovox.sources.live_poses import MAX_SPEED_MPS, MAX_TURN_DPS
-from stereovox.threads import MapLock
-from stereovox.trust.stamp_clock import RESET_NS
+from stereovox.frame.stamp_clock import RESET_NS
+from stereovox.geometry.se3 import Transform, apart, interpolate
+from stereovox.kernels.threads import MapLock
+from stereovox.sources.poses.live_poses import MAX_SPEED_MPS, MAX_TURN_DPS
 
 KEPT = 64
 """Last poses that are kept."""

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps import State, VoxelMap
 from stereovox.mavlink.sectors import check_number_of_cells, states_of
-from stereovox.se3 import Transform, rigidity_error
 
 LAYERS, LAYER_DEG, SECTOR_DEG = 5, 30, 45
 LEAST_M = 0.01

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.geometry.se2 import lifted
+from stereovox.geometry.se3 import Transform, from_quaternion, interpolate
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
-from stereovox.se2 import lifted
-from stereovox.se3 import Transform, from_quaternion, interpolate
-from stereovox.sources.tracker import turned
+from stereovox.sources.poses.tracker import turned
 
 LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
 """MAV_FRAME: the worlds and the body of ODOMETRY that are understood."""

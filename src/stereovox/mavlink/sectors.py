@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor_axes import up_of, upright_axes
-from stereovox.se3 import Transform, rigidity_error
+from stereovox.products.floor.floor_axes import up_of, upright_axes
 
 SECTORS = 72
 INCREMENT_DEG = 360 / SECTORS

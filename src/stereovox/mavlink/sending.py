@@ -12,12 +12,12 @@ import numpy as np
 
 from stereovox.errors import StereovoxError
 from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Cloud, UpdateReport
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.mapper import Mapper
 from stereovox.mavlink.body import Body, BodyPose
 from stereovox.mavlink.directions import DirectionRules, nearest_places
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
 
 T_BODY_LIDAR = np.eye(4)
 """Where a lidar is that is not named: at the body's origin, looking ahead."""

@@ -6,11 +6,11 @@ from __future__ import annotations
 from functools import cached_property
 
 from stereovox.errors import SourceError, StereovoxError
+from stereovox.frame.wall_clock import epoch_ns
+from stereovox.geometry.se3 import Transform
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.poses import PoseReceiver
-from stereovox.se3 import Transform
-from stereovox.sources.pose_stream import T_OPTICAL_BODY, PoseStream
-from stereovox.trust.wall_clock import epoch_ns
+from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
 
 PREFIX = "mavlink:"
 

@@ -3,10 +3,10 @@
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell
-from stereovox.maps import _cells
-from stereovox.maps._cells import NO_ROW, row_of
-from stereovox.maps._query import state_of
+from stereovox.kernels._jit import allocating_kernel, cell
+from stereovox.maps.cells import _cells
+from stereovox.maps.cells._cells import NO_ROW, row_of
+from stereovox.maps.query._query import state_of
 
 UNKNOWN, BIT = np.int32(_cells.UNKNOWN), np.uint8(1)
 

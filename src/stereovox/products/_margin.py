@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from stereovox._jit import kernel
-from stereovox.maps._cells import number_in, row_of
+from stereovox.kernels._jit import kernel
+from stereovox.maps.cells._cells import number_in, row_of
 
 SIDE = 8
 

@@ -8,10 +8,10 @@ all cells, tells them apart.
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell
-from stereovox.maps import _cells
-from stereovox.maps._cells import number_in
-from stereovox.maps._query import LATELY, NOWHERE, row_again, state_of
+from stereovox.kernels._jit import allocating_kernel, cell
+from stereovox.maps.cells import _cells
+from stereovox.maps.cells._cells import number_in
+from stereovox.maps.query._query import LATELY, NOWHERE, row_again, state_of
 
 UNKNOWN, FREE, TENTATIVE = np.int32(_cells.UNKNOWN), np.int32(_cells.FREE), np.int32(_cells.TENTATIVE)
 SAMPLES = 4

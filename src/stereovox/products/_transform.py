@@ -8,7 +8,7 @@ it was or becomes the least: where none does, nothing else is looked at again.
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell
+from stereovox.kernels._jit import allocating_kernel, cell
 
 FAR = np.int16(32000)
 FEW = 16

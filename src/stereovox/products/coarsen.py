@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cell_format import CellRules
-from stereovox.maps.pyramid import coarser_config
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.cells.pyramid import coarser_config
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.side_by_side import set_times
-from stereovox.threads import one_state
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
 """Cells (N, 3); and (N,) the number of known cells in each, the largest value these store, their latest time."""

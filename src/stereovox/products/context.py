@@ -14,9 +14,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stereovox.config import Config
-from stereovox.products.floor_axes import up_of
-from stereovox.products.floor_heights import FloorHeights
-from stereovox.trust.health import STALE, Health
+from stereovox.maps.record.health import STALE, Health
+from stereovox.products.floor.floor_axes import up_of
+from stereovox.products.floor.floor_heights import FloorHeights
 
 
 class HasMap(Protocol):

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.storage import EVERYWHERE
+from stereovox.maps.storage.blocks import CELLS, SIDE
+from stereovox.maps.storage.storage import EVERYWHERE
 from stereovox.products.side_by_side import add_blocks
-from stereovox.threads import one_state
 
 
 @one_state

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.files.safe_io import replacing
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cell_format import CellRules
+from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.moved import moved
 from stereovox.products.side_by_side import check_alike, in_memory, side_by_side
-from stereovox.safe_io import replacing
-from stereovox.threads import one_state
 
 
 @dataclass(frozen=True, eq=False)

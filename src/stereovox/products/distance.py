@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.files.safe_io import replacing
+from stereovox.kernels.threads import MapLock
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.cell_format import CellRules
-from stereovox.maps.queries import INDEX_LIMIT, points_of, state_bits
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.query.queries import INDEX_LIMIT, points_of, state_bits
+from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.products import _distance
 from stereovox.products.transform import Transform
-from stereovox.safe_io import replacing
-from stereovox.threads import MapLock
 
 TRIGGER = 1 / 8
 """A window follows the camera once that is farther from its centre than this share of the window."""

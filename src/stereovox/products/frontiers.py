@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.files.safe_io import replacing
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.blocks import CELLS
-from stereovox.maps.cell_format import CellRules
-from stereovox.maps.queries import points_of
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.query.queries import points_of
+from stereovox.maps.storage.blocks import CELLS
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.floor_axes import Heights, checked_band, heights_of
-from stereovox.products.floor_heights import known_floor
+from stereovox.products.floor.floor_axes import Heights, checked_band, heights_of
+from stereovox.products.floor.floor_heights import known_floor
 from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
 from stereovox.products.side_by_side import in_memory
-from stereovox.safe_io import replacing
-from stereovox.threads import one_state
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

@@ -10,15 +10,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap, unbounded
-from stereovox.maps.blocks import CELLS
-from stereovox.maps.cell_format import CellRules
-from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.cells.cell_times import LAST, NEVER, UNIT_NS
+from stereovox.maps.record.camera_path import CameraPath
+from stereovox.maps.record.history import MAX_REASONS, OTHERS, History
+from stereovox.maps.storage.blocks import CELLS
 from stereovox.products.moved import moved
 from stereovox.products.side_by_side import cells_at, check_alike, in_memory
-from stereovox.threads import one_state
-from stereovox.trust.camera_path import CameraPath
-from stereovox.trust.history import MAX_REASONS, OTHERS, History
 
 
 @one_state

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.cell_format import CellRules
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.record.camera_path import CameraPath, Seen
+from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved as _kernels
-from stereovox.products.floor_axes import nearest_axis, upright_axes
+from stereovox.products.floor.floor_axes import nearest_axis, upright_axes
 from stereovox.products.side_by_side import cells_at, in_memory, set_times
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
-from stereovox.threads import one_state
-from stereovox.trust.camera_path import CameraPath, Seen
 
 PIECE = 512
 """Blocks processed together."""

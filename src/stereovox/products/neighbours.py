@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import MAX_PLACES, SIDE
+from stereovox.maps.storage.blocks import MAX_PLACES, SIDE
 from stereovox.products import _margin
 
 FACES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

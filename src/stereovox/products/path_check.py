@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.queries import points_of
-from stereovox.threads import one_state
+from stereovox.maps.query.queries import points_of
 
 HALVINGS = 48
 """Bisection steps in the search for a place on a segment."""

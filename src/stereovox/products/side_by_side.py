@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap, unbounded
-from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
-from stereovox.maps.rolling import RollingStorage
+from stereovox.maps.storage.blocks import CELLS, SIDE, blocks_of_cells
+from stereovox.maps.storage.rolling import RollingStorage
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 """Coordinates (n, 3), and the cells (n, 512) of two maps as each stores them."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import in_shards
 from stereovox.products import _transform
-from stereovox.threads import in_shards
 
 LANES = 32
 """Rows are padded to a multiple of it: whole vectors."""

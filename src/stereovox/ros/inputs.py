@@ -18,14 +18,14 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Cloud, Frame, Scan
-from stereovox.ros.poses import Pose, PoseBuffer
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
+from stereovox.ros.poses.poses import Pose, PoseBuffer
 from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
 from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud
 from stereovox.sources.clouds.bag import cloud_of_scan
 from stereovox.sources.clouds.options import LidarOptions
-from stereovox.sources.poses import seconds_from_ns
+from stereovox.sources.poses.poses import seconds_from_ns
 from stereovox.sources.robots.bag import posed_scan
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 

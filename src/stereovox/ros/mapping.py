@@ -12,19 +12,19 @@ from typing import Any
 from stereovox.config import Config, load_config
 from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Cloud, Frame, Scan, UpdateReport
+from stereovox.frame.stamp_clock import StampsBy
+from stereovox.geometry.se3 import Transform
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
+from stereovox.mapping.rebuild import CorrectionReport, FrameKey
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.kept_frames import KeptFrame
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.maps.storage import EVERYWHERE
-from stereovox.products.floor_axes import Heights
-from stereovox.products.live_projection import LiveProjection
-from stereovox.rebuild import CorrectionReport, FrameKey
+from stereovox.maps.record.health import Health
+from stereovox.maps.record.history import History
+from stereovox.maps.record.kept_frames import KeptFrame
+from stereovox.maps.storage.storage import EVERYWHERE
+from stereovox.products.floor.floor_axes import Heights
+from stereovox.products.floor.live_projection import LiveProjection
 from stereovox.ros.background import Background
-from stereovox.se3 import Transform
-from stereovox.trust.health import Health
-from stereovox.trust.history import History
-from stereovox.trust.stamp_clock import StampsBy
 
 PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]
 """Returns new poses of kept frames (4, 4), by sensor and stamp."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.safe_io import check_local, read_text, replacing, yaml_value
+from stereovox.files.safe_io import check_local, read_text, replacing, yaml_value
 
 OURS, LAUNCH, RESULT = "nav2.yaml", "nav2.launch.py", "nav2_params.yaml"
 """Our parameters, the launch file, and the file that is made for Nav2."""

@@ -16,23 +16,23 @@ from typing import Any, NamedTuple
 
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Cloud, Frame, UpdateReport
-from stereovox.rebuild import CorrectionReport
-from stereovox.ros.clocks import SensorClocks
-from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
+from stereovox.geometry.se3 import inverse
+from stereovox.mapping.rebuild import CorrectionReport
 from stereovox.ros.inputs import PoseLookup, header
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.obstacles import Obstacles
 from stereovox.ros.options import Options
 from stereovox.ros.outputs import Outputs
-from stereovox.ros.pose_source import pose_source
-from stereovox.ros.poses import Pose, SensorPoses, fixed_transform
+from stereovox.ros.poses.clocks import SensorClocks
+from stereovox.ros.poses.corrections import AGAIN_S, PathCorrections, corrector_of
+from stereovox.ros.poses.pose_source import pose_source
+from stereovox.ros.poses.poses import Pose, SensorPoses, fixed_transform
+from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses
 from stereovox.ros.score import score_of
 from stereovox.ros.services import Services
 from stereovox.ros.stamps import StampsByNode
 from stereovox.ros.subscriptions import Silence, Subscriptions
-from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses
-from stereovox.se3 import inverse
-from stereovox.sources.clock_watch import Heard
+from stereovox.sources.poses.clock_watch import Heard
 from stereovox.sources.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.errors import StereovoxError
+from stereovox.geometry import se2
+from stereovox.geometry.se3 import Transform
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
 from stereovox.ros.outputs import points_message
-from stereovox.se3 import Transform
 
 OBSTACLES, FREE_RAYS = "obstacles", "free_rays"
 """Topics."""

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from stereovox.cameras.lidar import USUAL_SIGMA_M
 from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.files.safe_io import FLOOR_READABLE
 from stereovox.localize.robot_track import parse_start
-from stereovox.pose_choice import GIVEN, TRACK
-from stereovox.safe_io import FLOOR_READABLE
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.clouds.options import LidarOptions
 
 PREFIX = "ros."

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.formats.octomap import binary_tree, full_tree
 from stereovox.maps import VoxelMap
-from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.maps.record.health import STALE, Health
+from stereovox.maps.storage.cubes import in_cubes
 from stereovox.ros.library import optional_message
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
-from stereovox.trust.health import STALE, Health
 
 FLOAT32 = 7
 """`sensor_msgs/PointField` type."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stereovox.trust.stamp_clock import AHEAD_NS, EPOCH_NS
+from stereovox.frame.stamp_clock import AHEAD_NS, EPOCH_NS
 
 
 class StampsByNode:

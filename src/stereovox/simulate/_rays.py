@@ -6,7 +6,7 @@ What decides about a hit is rounded as NumPy rounds it, so that simulations are 
 
 import numpy as np
 
-from stereovox._jit import cell, exact_cell, kernel
+from stereovox.kernels._jit import cell, exact_cell, kernel
 
 LANES = 32
 """Rays that go together. Of an image these lie side by side, and mostly meet the same boxes."""

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 TWO, THREE = np.float32(2), np.float32(3)

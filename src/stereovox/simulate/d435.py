@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Reason
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 
 HFOV_DEG = 91.2
 CAMERA = PinholeCamera.from_field_of_view(848, 480, HFOV_DEG, baseline=0.05)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stereovox.se3 import Transform, inverse, rotation_matrix
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 from stereovox.simulate.t265 import OPENGL, STEP_S, Drift, drifted, start_frame
 
 YAW_DEG = 5.0

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from stereovox.se3 import Transform, look_at
+from stereovox.geometry.se3 import Transform, look_at
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.scene import Scene, Solid, box
 from stereovox.simulate.stage import Stage, within

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.frame import Reason
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.simulate import _texture
 from stereovox.simulate.d435 import D435, JUMP_PX, extreme, hidden_from_right_eye, smooth_noise
 from stereovox.simulate.floors.kinect import WIDTH, kinect_camera

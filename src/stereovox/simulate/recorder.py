@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Frame
-from stereovox.se3 import Transform, inverse, rotation_matrix
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 from stereovox.simulate.simulation import Simulation
 from stereovox.simulate.t265 import OPENGL, RATE_HZ, T265, Track, start_frame, write_track
-from stereovox.sources.camera_file import MATRIX
-from stereovox.sources.pair_file import FILE, PairSettings, pair_text
-from stereovox.sources.poses import seconds_from_ns
-from stereovox.sources.rgbd.tum import IMAGES, LIST
+from stereovox.sources.calibration.camera_file import MATRIX
+from stereovox.sources.poses.poses import seconds_from_ns
+from stereovox.sources.rgbd.layouts.tum import IMAGES, LIST
+from stereovox.sources.rigs.pair_file import FILE, PairSettings, pair_text
 
 TRACKER = "tracker.txt"
 START_NS = 1_000_000_000_000

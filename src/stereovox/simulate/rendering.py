@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.lenses import Lens
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.simulate import _texture
 from stereovox.simulate.scene import Scene
 

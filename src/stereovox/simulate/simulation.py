@@ -15,7 +15,7 @@ from stereovox import registry
 from stereovox.cameras.lenses import Lens
 from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Photo, Reason
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.simulate.d435 import D435, classify, depth_camera
 from stereovox.simulate.drift import CameraPath, drifting
 from stereovox.simulate.floors.kinect import WIDTH
@@ -27,17 +27,17 @@ from stereovox.sources import parameters
 from stereovox.sources.base import DepthSource
 
 SCENES = {
-    "room": "stereovox.simulate.room:stage",
-    "box": "stereovox.simulate.plain_scenes:box_stage",
-    "aisle": "stereovox.simulate.plain_scenes:aisle_stage",
-    "apartment": "stereovox.simulate.apartment:stage",
-    "wall": "stereovox.simulate.plain_scenes:wall_stage",
+    "room": "stereovox.simulate.scenes.room:stage",
+    "box": "stereovox.simulate.scenes.plain_scenes:box_stage",
+    "aisle": "stereovox.simulate.scenes.plain_scenes:aisle_stage",
+    "apartment": "stereovox.simulate.scenes.apartment:stage",
+    "wall": "stereovox.simulate.scenes.plain_scenes:wall_stage",
     "flight": "stereovox.simulate.flight:stage",
-    "town": "stereovox.simulate.town:stage",
-    "loop": "stereovox.simulate.loop:stage",
-    "offices": "stereovox.simulate.offices:stage",
-    "racks": "stereovox.simulate.racks:stage",
-    "hall": "stereovox.simulate.hall:stage",
+    "town": "stereovox.simulate.scenes.town:stage",
+    "loop": "stereovox.simulate.scenes.loop:stage",
+    "offices": "stereovox.simulate.scenes.offices:stage",
+    "racks": "stereovox.simulate.scenes.racks:stage",
+    "hall": "stereovox.simulate.scenes.hall:stage",
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")

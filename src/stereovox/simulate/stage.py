@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.se3 import Transform, transform_points
+from stereovox.geometry.se3 import Transform, transform_points
 from stereovox.simulate.d435 import D435
 from stereovox.simulate.scene import Point, Scene, Solid
 

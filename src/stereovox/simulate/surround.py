@@ -17,10 +17,10 @@ from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Reason, StereoFrame
-from stereovox.se3 import Transform, look_at, rotation_matrix
-from stereovox.simulate import room
+from stereovox.geometry.se3 import Transform, look_at, rotation_matrix
 from stereovox.simulate.rendering import photograph
 from stereovox.simulate.scene import Scene
+from stereovox.simulate.scenes import room
 from stereovox.simulate.stage import Stage, one_of, within
 from stereovox.sources import parameters
 from stereovox.sources.base import Source

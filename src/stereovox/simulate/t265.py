@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.se3 import Transform, inverse
-from stereovox.sources.poses import seconds_from_ns
+from stereovox.geometry.se3 import Transform, inverse
+from stereovox.sources.poses.poses import seconds_from_ns
 
 STEP_S = 0.05
 """Seconds between steps of the drift, which is slow and interpolated."""

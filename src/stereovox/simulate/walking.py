@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.se3 import Transform, look_at, rotation_matrix
+from stereovox.geometry.se3 import Transform, look_at, rotation_matrix
 
 TURN_DEG = 70.0
 """Degrees a second at which the camera turns."""

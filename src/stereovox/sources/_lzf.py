@@ -4,7 +4,7 @@
 By hand, because no dependency unpacks LZF, and this one cannot write past the size it was given.
 """
 
-from stereovox._jit import kernel
+from stereovox.kernels._jit import kernel
 
 LITERALS = 32
 """Control bytes below it announce so many bytes and one more; others a piece of what was written before."""

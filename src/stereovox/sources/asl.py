@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import NoPoses, SourceError
-from stereovox.safe_io import MAX_LIST, read_text
-from stereovox.se3 import Transform, inverse
+from stereovox.files.safe_io import MAX_LIST, read_text
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.base import Part
-from stereovox.sources.calibration_files import read_calibration
-from stereovox.sources.calibration_values import StereoCalibration, read_yaml, rigid
+from stereovox.sources.calibration.calibration_files import read_calibration
+from stereovox.sources.calibration.calibration_values import StereoCalibration, read_yaml, rigid
 from stereovox.sources.images import file_names
 from stereovox.sources.imu import ImuReadings, checked_imu, in_order
 from stereovox.sources.parameters import file_of
-from stereovox.sources.poses import Poses, UnknownPoses, seconds_from_ns
+from stereovox.sources.poses.poses import Poses, UnknownPoses, seconds_from_ns
+from stereovox.sources.poses.trajectory import Trajectory, inside, transforms
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig import RigSource, Shot
-from stereovox.sources.rig_file import Rig, RigPair, Virtual, usual_virtual
-from stereovox.sources.rig_options import POSES, as_body, folder_and_options, poses_of_images
-from stereovox.sources.trajectory import Trajectory, inside, transforms
+from stereovox.sources.rigs.rig import RigSource, Shot
+from stereovox.sources.rigs.rig_file import Rig, RigPair, Virtual, usual_virtual
+from stereovox.sources.rigs.rig_options import POSES, as_body, folder_and_options, poses_of_images
 
 ROOT, EYES, DATA, SENSOR = "mav0", ("cam0", "cam1"), "data.csv", "sensor.yaml"
 IMU = "imu0"

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, Frame
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.imu import Imu
 
 T = TypeVar("T")

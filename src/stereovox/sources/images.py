@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import MAX_PIXELS
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import read_bounded
+from stereovox.files.safe_io import read_bounded
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"

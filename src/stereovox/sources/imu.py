@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import SourceError, StereovoxError
-from stereovox.se3 import Transform, rigidity_error
+from stereovox.geometry.se3 import Transform, rigidity_error
 
 RIGID = 1e-3
 """Largest rigidity error of a mount."""

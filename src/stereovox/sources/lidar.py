@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
+from stereovox.files.safe_io import MAX_LIST, read_bounded
 from stereovox.frame import Viewpoint
-from stereovox.safe_io import MAX_LIST, read_bounded
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 
 POINT_BYTES = 16
 """A point in a KITTI `.bin`: x, y, z in metres and the reflectance, float32 each."""

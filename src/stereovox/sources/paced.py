@@ -9,8 +9,8 @@ from threading import Event
 from time import monotonic_ns
 
 from stereovox.frame import AnyFrame
+from stereovox.frame.wall_clock import epoch_ns
 from stereovox.sources.base import Stream
-from stereovox.trust.wall_clock import epoch_ns
 
 
 class Paced(Stream):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import MAX_PIXELS, PinholeCamera
 from stereovox.errors import FrameRefused
-from stereovox.safe_io import read_bounded
+from stereovox.files.safe_io import read_bounded
 from stereovox.sources.images import MAX_BYTES, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")

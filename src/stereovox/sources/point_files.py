@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import ConfigError, MapFileError
-from stereovox.safe_io import read_bounded, shown
+from stereovox.files.safe_io import read_bounded, shown
 from stereovox.sources._lzf import unpack
 
 MAX_BYTES = 1 << 32

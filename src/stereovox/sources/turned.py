@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from stereovox.frame import AnyFrame
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.base import Changed, Source, Stream, imu_of
 from stereovox.sources.imu import Imu
 

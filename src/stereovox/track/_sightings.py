@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernel that sums what landmarks say of the pose of the camera that sees them."""
 
-from stereovox._jit import kernel
+from stereovox.kernels._jit import kernel
 
 
 @kernel

@@ -8,7 +8,7 @@ normals, 8 number of patches.
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 EMPTY = np.int64(-1)
 FIELDS = 9

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 NEAREST = 0.05
 """Depth in metres before which nothing is seen."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.se3 import Transform, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import Transform, rotation_matrix, rotation_vector
 
 STEPS = 6
 """Steps of least squares in each stage."""

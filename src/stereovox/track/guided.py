@@ -9,7 +9,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.frame import AnyFrame
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.track.fit import RIGID
 from stereovox.track.tracker import Tracked, Tracker
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.se3 import rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import rotation_matrix, rotation_vector
 from stereovox.sources.base import Stream, imu_of
 from stereovox.sources.imu import Imu, ImuReadings, up_of_force
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.track.corners import Kind, described, flow, in_common, strongest
 from stereovox.track.sightings import AGREED, Corners, Sightings
 from stereovox.track.views import is_new

@@ -14,7 +14,7 @@ from stereovox.cameras.rigs import StereoPair
 from stereovox.depth.stereo.pipeline import grey_rectified
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame, name_of
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.track.corners import SHARP, flow
 from stereovox.track.fit import Fit, Limits, Stage, settled
 from stereovox.track.landmarks import Landmarks, Sight

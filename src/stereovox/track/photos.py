@@ -15,14 +15,14 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.stereo.pipeline import grey
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
+from stereovox.frame.validate import matrix_of
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
 from stereovox.track.corners import SOFT, WINDOW
 from stereovox.track.fit import RIGID, Equations, Fit, Stage, motion_between, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
-from stereovox.trust.validate import matrix_of
 
 MAX_ARM_M = 10.0
 """Farthest that a camera can be beside the depth camera."""

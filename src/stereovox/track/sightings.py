@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.track._sightings import equations
 from stereovox.track.fit import Equations
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
+from stereovox.kernels.threads import expecting
 from stereovox.sources.base import Stream
-from stereovox.threads import expecting
 from stereovox.track.fit import LOST, deviations
 from stereovox.track.tracker import POSE_FAULTS, Tracked
 

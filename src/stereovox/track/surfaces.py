@@ -14,8 +14,8 @@ from stereovox.config import Config
 from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Frame
+from stereovox.geometry.se3 import Transform
 from stereovox.integrate.views import PerCamera
-from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
 from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, motion_between, settled
 from stereovox.track.photos import Beside, Photos, Sighted, sighted_or_why

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.frame import DepthImage
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.track._surfels import EMPTY, FIELDS, carry, drop, equations, nearest, normals, patches, put
 from stereovox.track.fit import Fit, Stage, settled
 

@@ -15,8 +15,8 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
-from stereovox.products.floor_axes import up_of
-from stereovox.se3 import (
+from stereovox.frame.validate import matrix_of
+from stereovox.geometry.se3 import (
     Transform,
     interpolate,
     inverse,
@@ -25,13 +25,13 @@ from stereovox.se3 import (
     rotation_between,
     rotation_vector,
 )
+from stereovox.kernels.threads import Ahead
+from stereovox.products.floor.floor_axes import up_of
 from stereovox.sources.imu import Imu
-from stereovox.threads import Ahead
 from stereovox.track.fit import RIGID, Fit, Limits, deviations
 from stereovox.track.inertial import Gyroscope, Turn, up_by_force
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
-from stereovox.trust.validate import matrix_of
 
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector
 from stereovox.track import _views
 
 GRID = (30, 40)

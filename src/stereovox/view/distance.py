@@ -10,9 +10,9 @@ import numpy as np
 
 from stereovox.errors import StereovoxError
 from stereovox.products.distance import DistanceField
-from stereovox.products.floor_axes import floor_axes
-from stereovox.view.drawn import UPS, checked_up
+from stereovox.products.floor.floor_axes import floor_axes
 from stereovox.view.figures import WIDTH, figure_of, save, title_above
+from stereovox.view.scene.drawn import UPS, checked_up
 
 COLOURS = "viridis"
 LINES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)

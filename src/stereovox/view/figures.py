@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
+from stereovox.files.safe_io import replacing
 from stereovox.maps import VoxelMap
-from stereovox.safe_io import replacing
 from stereovox.view.panels import GREY, INK, LINE
 
 DPI = 120

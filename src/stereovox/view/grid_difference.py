@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.grid_lattice import Laid, three_states
-from stereovox.evaluate.grid_scores import Difference, differences, wrong
+from stereovox.evaluate.grids.grid_lattice import Laid, three_states
+from stereovox.evaluate.grids.grid_scores import Difference, differences, wrong
 from stereovox.maps import State
 from stereovox.view.figures import blank, png_of
 from stereovox.view.grid import Box, bounds, framed, paint, plan

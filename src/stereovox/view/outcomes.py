@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.evaluate.outcomes import Outcome, Outcomes
-from stereovox.view.drawn import UPS, checked_up
 from stereovox.view.evaluation import DPI, WIDTH
 from stereovox.view.figures import blank, png_of
 from stereovox.view.panels import measured, title
+from stereovox.view.scene.drawn import UPS, checked_up
 
 RIGHT, WRONG, MISS, NEVER = "#2f7fb8", "#e59a1f", "#b3205f", "#b9bec7"
 EXACT = {

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.maps import State
-from stereovox.view.drawn import Drawn
-from stereovox.view.render import Direction, render
+from stereovox.view.scene.drawn import Drawn
+from stereovox.view.scene.render import Direction, render
 
 INK, GREY, LINE = "#1b2333", "#555d6b", "#c8cdd5"
 STATE_COLOURS = {

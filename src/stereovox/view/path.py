@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.products.floor_axes import floor_axes
-from stereovox.products.floor_heights import FloorHeights
+from stereovox.products.floor.floor_axes import floor_axes
+from stereovox.products.floor.floor_heights import FloorHeights
+from stereovox.products.floor.projection import from_above
 from stereovox.products.path_check import point_along
-from stereovox.products.projection import from_above
-from stereovox.view.drawn import UPS, turned
 from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.grid import bounds, framed, legend, plan, trimmed
 from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, measured
+from stereovox.view.scene.drawn import UPS, turned
 
 STEPS = 400
 """Number of points along the path at which the clearance is measured."""

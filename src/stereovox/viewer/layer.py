@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.kernels.threads import Newest
 from stereovox.maps import State, VoxelMap
-from stereovox.products.slices import Layer, layer
-from stereovox.threads import Newest
-from stereovox.view.drawn import stood_up
-from stereovox.view.scale import Scale, scale_of
+from stereovox.products.floor.slices import Layer, layer
+from stereovox.view.scene.drawn import stood_up
+from stereovox.view.scene.scale import Scale, scale_of
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer

@@ -12,9 +12,9 @@ from typing import Any
 from stereovox.frame import AnyFrame, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.maps.cubes import in_cubes
-from stereovox.trust.health import STALE
-from stereovox.trust.history import History
+from stereovox.maps.record.health import STALE
+from stereovox.maps.record.history import History
+from stereovox.maps.storage.cubes import in_cubes
 from stereovox.viewer.frame import FramePanel, describe_frame
 from stereovox.viewer.panel import plain
 from stereovox.viewer.serve import HERE, PORT

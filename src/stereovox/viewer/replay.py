@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from stereovox.config import Config, WindowConfig
 from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import Newest
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.maps.cubes import in_cubes
-from stereovox.threads import Newest
+from stereovox.maps.storage.cubes import in_cubes
 from stereovox.viewer.frame import FramePanel, describe_frame
 from stereovox.viewer.viewer import Viewer
 

@@ -12,8 +12,8 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.sphere import SphereLayout, accumulate, empty, frame_of, gather, through_sphere
 from stereovox.frame import DepthImage, Frame, Reason
+from stereovox.geometry.se3 import rotation_matrix, transform_points
 from stereovox.mapper import Mapper
-from stereovox.se3 import rotation_matrix, transform_points
 from stereovox.sensors.noise import SUBPIXEL, RangeNoise
 
 

@@ -22,7 +22,7 @@ from stereovox.depth.sphere import (
 )
 from stereovox.errors import ConfigError
 from stereovox.frame import DepthImage, Reason
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 
 CAMERAS = {
     "pinhole": PinholeCamera.from_field_of_view(60, 40, 90, 0.15),

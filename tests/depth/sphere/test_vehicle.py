@@ -15,7 +15,7 @@ from stereovox.depth.sphere.vehicle import vehicle_grid
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.errors import StereovoxError
 from stereovox.frame import StereoFrame
-from stereovox.se3 import rotation_matrix
+from stereovox.geometry.se3 import rotation_matrix
 
 CAMERA = PinholeCamera(160, 120, 100.0, 100.0, 79.5, 59.5, 0.1)
 UPRIGHT = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

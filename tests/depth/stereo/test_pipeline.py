@@ -17,7 +17,7 @@ from stereovox.depth.stereo.matchers import MATCHERS, make_matcher
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import Reason, StereoFrame
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 
 HEIGHT, WIDTH = 120, 240
 CAMERA = PinholeCamera(WIDTH, HEIGHT, 200.0, 200.0, 119.5, 59.5, baseline=0.2)

@@ -16,7 +16,7 @@ from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import StereoFrame
-from stereovox.se3 import inverse, rotation_matrix, transform_points
+from stereovox.geometry.se3 import inverse, rotation_matrix, transform_points
 
 NARROW = Lens("pinhole", 400, 300, 330.0, 332.0, 203.0, 147.0, (-0.28, 0.09, 0.0009, -0.0006))
 OTHER = Lens("pinhole", 400, 300, 327.0, 326.0, 196.0, 152.0, (-0.25, 0.07, -0.0004, 0.0008))

@@ -14,13 +14,13 @@ from made_frames import a_recording
 
 from stereovox import load_config
 from stereovox.errors import ConfigError, StereovoxError
-from stereovox.lab.bench import growth, start
-from stereovox.lab.bench.growth import cost_along_path, cost_by_map_size, far_blocks, path_table, ratio_of, size_table
-from stereovox.lab.bench.more import MEASUREMENTS, Given, check_names
-from stereovox.lab.bench.overhead import empty_frame, overhead, overhead_table, thread_scaling, thread_table
-from stereovox.lab.bench.results import Table
-from stereovox.lab.bench.start import first_frame, first_frame_table, start_up, start_up_table
 from stereovox.mapper import Mapper, UpdateReport
+from stereovox_lab.bench import growth, start
+from stereovox_lab.bench.growth import cost_along_path, cost_by_map_size, far_blocks, path_table, ratio_of, size_table
+from stereovox_lab.bench.more import MEASUREMENTS, Given, check_names
+from stereovox_lab.bench.overhead import empty_frame, overhead, overhead_table, thread_scaling, thread_table
+from stereovox_lab.bench.results import Table
+from stereovox_lab.bench.start import first_frame, first_frame_table, start_up, start_up_table
 
 COARSE = load_config(voxel_size=0.2)
 
@@ -44,7 +44,7 @@ def test_threads_of_all_cores_and_the_warm_up_does_not_count(monkeypatch):
         return UpdateReport(integrate_ms=1000.0 if len(seen) <= 12 else 10.0 - mapper.config.threads)
 
     monkeypatch.setattr(Mapper, "add", add)
-    monkeypatch.setattr("stereovox.lab.bench.overhead.cores", lambda: 4)
+    monkeypatch.setattr("stereovox_lab.bench.overhead.cores", lambda: 4)
     result = thread_scaling(a_recording(), [0.2])
     assert [row["integrate_ms_median"] for row in result["rows"]] == [9.0, 8.0, 7.0, 6.0]
     assert [row["faster"] for row in result["rows"]] == [1.0, 1.125, 1.286, 1.5]
@@ -92,7 +92,7 @@ def test_ctrl_c_leaves_no_process_and_no_folder(send, tmp_path):
     code = """
 from made_frames import a_recording
 from stereovox import load_config
-from stereovox.lab.bench import start
+from stereovox_lab.bench import start
 start.FIRST_FRAME = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
 Popen = start.subprocess.Popen
 def told(*words, **more):
@@ -159,7 +159,7 @@ def test_the_fixed_part_is_where_a_line_meets_no_pixels(monkeypatch):
         return UpdateReport()
 
     monkeypatch.setattr(Mapper, "add", add)
-    monkeypatch.setattr("stereovox.lab.bench.overhead.perf_counter", lambda: now[0])
+    monkeypatch.setattr("stereovox_lab.bench.overhead.perf_counter", lambda: now[0])
     result = overhead(COARSE, repeats=2)
     assert result["fixed_us"] == pytest.approx(40, abs=0.2)
     assert result["rows"][-1]["add_us"] == pytest.approx(40 + 3072, abs=0.2)
@@ -286,7 +286,7 @@ def test_measurements_are_made_in_their_order_and_slips_are_one_line():
 
 def test_kernels_are_looked_for_where_the_environment_says(monkeypatch, tmp_path):
     """A fresh process finds an empty cache, as `first_frame` promises."""
-    code = "from stereovox._jit import cache_folder; print(cache_folder(), any(cache_folder().rglob('*.nbi')))"
+    code = "from stereovox.kernels._jit import cache_folder; print(cache_folder(), any(cache_folder().rglob('*.nbi')))"
     with start._process(["-c", code], {"STEREOVOX_CACHE": str(tmp_path / "new")}) as child:
         said = child.communicate()[0].split()
     assert said[0].startswith(str(tmp_path / "new") + os.sep)

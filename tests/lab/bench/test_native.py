@@ -14,11 +14,11 @@ from made_frames import CAMERA, a_frame
 
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.errors import MissingExtra, StereovoxError
-from stereovox.lab.bench import native
-from stereovox.lab.bench.frames import read_frames
-from stereovox.lab.bench.peers import PEERS, find_peer
-from stereovox.lab.bench.results import comparison_table
-from stereovox.lab.bench.rows import Variant, bench, compare
+from stereovox_lab.bench import native
+from stereovox_lab.bench.frames import read_frames
+from stereovox_lab.bench.peers import PEERS, find_peer
+from stereovox_lab.bench.results import comparison_table
+from stereovox_lab.bench.rows import Variant, bench, compare
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 NAMES = ("octomap-cpp", "bonxai", "ufomap", "wavemap-cpp")

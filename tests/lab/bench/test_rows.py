@@ -17,12 +17,12 @@ from made_frames import CAMERA, a_frame
 from stereovox.cameras.wide import SphericalCamera
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
 from stereovox.frame import Frame, Reason
-from stereovox.lab.bench import peers as peers_module
-from stereovox.lab.bench import rows as bench_module
-from stereovox.lab.bench.frames import read_frames
-from stereovox.lab.bench.peers import PEERS, find_peer, installed
-from stereovox.lab.bench.results import comparison_table
-from stereovox.lab.bench.rows import PASSES, Variant, bench, compare, format_table
+from stereovox_lab.bench import peers as peers_module
+from stereovox_lab.bench import rows as bench_module
+from stereovox_lab.bench.frames import read_frames
+from stereovox_lab.bench.peers import PEERS, find_peer, installed
+from stereovox_lab.bench.results import comparison_table
+from stereovox_lab.bench.rows import PASSES, Variant, bench, compare, format_table
 
 ROW_KEYS = {
     "library", "voxel_size", "threads", "frames", "integrate_ms_median", "integrate_ms_p90", "integrate_ms_p99",

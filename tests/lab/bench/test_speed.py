@@ -5,10 +5,10 @@ import warnings
 
 import pytest
 
-from stereovox.lab.bench import files
-from stereovox.lab.bench.files import speed_png
-from stereovox.lab.bench.machine import machine
 from stereovox.view.figures import blank
+from stereovox_lab.bench import files
+from stereovox_lab.bench.files import speed_png
+from stereovox_lab.bench.machine import machine
 
 
 def made(sizes, peers=("octomap", "wavemap", "pyoctomap"), name="kitchen", ours="stereovox", others=()):

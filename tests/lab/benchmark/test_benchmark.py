@@ -19,15 +19,15 @@ from stereovox.evaluate.cells import indices, keys, position
 from stereovox.evaluate.lidar_truth import lidar_truth
 from stereovox.evaluate.truth import exact_occupancy
 from stereovox.evaluate.truth_cells import TruthCells
-from stereovox.lab.bench.peers import find_peer
-from stereovox.lab.benchmark import data as data_module
-from stereovox.lab.benchmark.data import DEPTH, LIDAR, Task, tasks_of
-from stereovox.lab.benchmark.libraries import find_libraries
-from stereovox.lab.benchmark.run import judged, means, run_benchmark
-from stereovox.lab.benchmark.seen import END, FREE, Seen, truth_of
-from stereovox.report.benchmark import COLUMNS, benchmark_page, rows_of
-from stereovox.se3 import look_at
+from stereovox.geometry.se3 import look_at
 from stereovox.simulate.simulation import Simulation
+from stereovox_lab.bench.peers import find_peer
+from stereovox_lab.benchmark import data as data_module
+from stereovox_lab.benchmark.data import DEPTH, LIDAR, Task, tasks_of
+from stereovox_lab.benchmark.libraries import find_libraries
+from stereovox_lab.benchmark.run import judged, means, run_benchmark
+from stereovox_lab.benchmark.seen import END, FREE, Seen, truth_of
+from stereovox_lab.report.benchmark import COLUMNS, benchmark_page, rows_of
 
 SMALL = "sim:box?image_width=96&frames=4"
 CAMERA = sv.PinholeCamera(12, 9, 9.0, 9.0, 5.5, 4.0)

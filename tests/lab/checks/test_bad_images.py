@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.lab.checks.bad_images import Trial, bad_frames, displaced, metres, trial
-from stereovox.lab.checks.lasting import FAULTS, Bad
-from stereovox.se3 import look_at
-from stereovox.simulate.passer_by import PasserBy
+from stereovox.geometry.se3 import look_at
 from stereovox.simulate.scene import box
+from stereovox_lab.checks.bad_images import Trial, bad_frames, displaced, metres, trial
+from stereovox_lab.checks.lasting import FAULTS, Bad
+from stereovox_lab.checks.passer_by import PasserBy
 
 CANNOT_BE_TOLD = {"half black"}
 """What is harmless as it is."""

@@ -7,9 +7,9 @@ import pytest
 
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.frame import Reason
-from stereovox.lab.checks.ghosts import ghosts, passed_cells, seen_free, time_to_clear
 from stereovox.maps import State
-from stereovox.simulate.passer_by import BEFORE, POLE, WALK_X, PasserBy
+from stereovox_lab.checks.ghosts import ghosts, passed_cells, seen_free, time_to_clear
+from stereovox_lab.checks.passer_by import BEFORE, POLE, WALK_X, PasserBy
 
 U, F, T, O = State.UNKNOWN, State.FREE, State.TENTATIVE, State.OCCUPIED  # noqa: E741
 SMALL = {"image_width": 160, "pole_m": 0.04}
@@ -36,7 +36,7 @@ def passed(background, **changes):
         return truly_seen(background, i, side, max_range)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stereovox.lab.checks.ghosts.seen_free", seen)
+        patch.setattr("stereovox_lab.checks.ghosts.seen_free", seen)
         return ghosts(*scene(background), voxel_size=0.1, **changes)
 
 

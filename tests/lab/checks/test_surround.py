@@ -9,10 +9,10 @@ from stereovox.depth import prepare
 from stereovox.depth.sphere import SphereLayout, accumulate, empty, stitch
 from stereovox.depth.sphere.vehicle import vehicle_grid
 from stereovox.frame import Reason
-from stereovox.lab.checks.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
 from stereovox.simulate.scene import Scene, box
 from stereovox.simulate.surround import Surround
+from stereovox_lab.checks.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import pytest
 
 from stereovox.config import load_config
 from stereovox.errors import SourceError
-from stereovox.lab.flights.air import Air
 from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import Scene, box
 from stereovox.simulate.simulation import Simulation
+from stereovox_lab.flights.air import Air
 
 CELL = 0.1
 INSIDE = np.array([1.05, 1.05, 1.05])

@@ -6,7 +6,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.lab.flights.campaign import summary
+from stereovox_lab.flights.campaign import summary
 
 SHORT = sv.Cruise(seconds=12.0, camera_hz=5.0)
 

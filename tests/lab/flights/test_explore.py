@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.lab.flights import explore
-from stereovox.lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, fly
-from stereovox.lab.flights.flight import World
 from stereovox.products.frontiers import Frontier
+from stereovox_lab.flights import explore
+from stereovox_lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, fly
+from stereovox_lab.flights.flight import World
 
 SHORT = Cruise(seconds=35.0)
 

@@ -7,7 +7,7 @@ import pytest
 from flights import changed, told
 
 from stereovox import StereovoxError
-from stereovox.lab.flights.flight import START_ROOM, Setup, Sticks, World, fly
+from stereovox_lab.flights.flight import START_ROOM, Setup, Sticks, World, fly
 
 SHORT = Setup(seconds=12.0)
 

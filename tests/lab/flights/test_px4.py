@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereovox.lab.flights.px4 import CollisionPrevention, Parameters, max_speed
+from stereovox_lab.flights.px4 import CollisionPrevention, Parameters, max_speed
 
 NO_DATA, FREE = 65535, 501
 AHEAD = np.array([1.0, 0.0])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.lab.papers.chien.aisle import AisleFound, Variant, compare_aisles
-from stereovox.lab.papers.chien.aisle import claims_of as aisle_claims
-from stereovox.lab.papers.chien.boxes import Placement, claims_of, find_box, find_boxes, random_placements
 from stereovox.maps import VoxelMap
+from stereovox_lab.papers.chien.aisle import AisleFound, Variant, compare_aisles
+from stereovox_lab.papers.chien.aisle import claims_of as aisle_claims
+from stereovox_lab.papers.chien.boxes import Placement, claims_of, find_box, find_boxes, random_placements
 
 
 @pytest.fixture(scope="module")

@@ -13,18 +13,18 @@ from made_pages import Balanced
 
 from stereovox.cli import main
 from stereovox.formats.map_server import read_map_server
-from stereovox.lab.papers import ist2019, reproduce
-from stereovox.lab.papers.ist.claims import claims_of, fan_claims, numbers_of
-from stereovox.lab.papers.ist.drives import PLACES, Drive, Extent, record
-from stereovox.lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
-from stereovox.lab.papers.ist.publish import time_publishing
-from stereovox.lab.papers.ist.survey import _judge, survey
-from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
-from stereovox.lab.papers.ist2019 import QUICK, Sizes
 from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.simulate.floors.bag import write_bag
 from stereovox.simulate.floors.floor import Floor
+from stereovox_lab.papers import ist2019, reproduce
+from stereovox_lab.papers.ist.claims import claims_of, fan_claims, numbers_of
+from stereovox_lab.papers.ist.drives import PLACES, Drive, Extent, record
+from stereovox_lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
+from stereovox_lab.papers.ist.publish import time_publishing
+from stereovox_lab.papers.ist.survey import _judge, survey
+from stereovox_lab.papers.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
+from stereovox_lab.papers.ist2019 import QUICK, Sizes
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 pytest.importorskip("gtsam", reason="needs the extra 'slam'")

@@ -7,11 +7,11 @@ import pytest
 from made_pages import Balanced
 
 from stereovox.errors import StereovoxError
-from stereovox.lab.papers import PAPERS, chien2020, reproduce
-from stereovox.lab.papers.chapter import NO, UNJUDGED, YES, Chapter, Claim, Sheet, Shown, count
-from stereovox.lab.papers.chien.own import map_own
-from stereovox.lab.papers.output import report
 from stereovox.simulate.simulation import Simulation
+from stereovox_lab.papers import PAPERS, chien2020, reproduce
+from stereovox_lab.papers.chapter import NO, UNJUDGED, YES, Chapter, Claim, Sheet, Shown, count
+from stereovox_lab.papers.chien.own import map_own
+from stereovox_lab.papers.output import report
 
 CHAPTER = Chapter(
     "boxes",

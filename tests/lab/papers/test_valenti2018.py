@@ -12,11 +12,11 @@ import pytest
 
 from stereovox.cli import main
 from stereovox.errors import SourceError
-from stereovox.lab.papers import reproduce, valenti2018
-from stereovox.lab.papers.valenti import chapters
-from stereovox.lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS
-from stereovox.lab.papers.valenti.recordings import find_drives
-from stereovox.lab.papers.valenti2018 import TABLE, Extent, experiments
+from stereovox_lab.papers import reproduce, valenti2018
+from stereovox_lab.papers.valenti import chapters
+from stereovox_lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS
+from stereovox_lab.papers.valenti.recordings import find_drives
+from stereovox_lab.papers.valenti2018 import TABLE, Extent, experiments
 
 
 @pytest.fixture(autouse=True)

@@ -6,9 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stereovox import load_config, se2
+from stereovox import load_config
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import Clock, Localiser, localise
 from stereovox.localize.scan_beams import beams_of
 from stereovox.maps.occupancy import OccupancyGrid

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from stereovox import se2
+from stereovox.geometry import se2
 from stereovox.localize.amcl.models import distance_field
 from stereovox.maps.occupancy import OccupancyGrid
 

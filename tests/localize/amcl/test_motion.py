@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.config.robot import AmclConfig
+from stereovox.geometry import se2
 from stereovox.localize.amcl.models import moved, turn_go_turn
 
 NOISY = AmclConfig(alpha1=0.02, alpha2=0.005, alpha3=0.004, alpha4=0.006)

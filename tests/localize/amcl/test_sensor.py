@@ -4,9 +4,9 @@ import math
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.config.robot import AmclConfig
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl import _amcl
 from stereovox.localize.amcl.models import BeamModel, FieldModel, beam_likelihood, distance_field
 from stereovox.localize.scan_beams import beams_of

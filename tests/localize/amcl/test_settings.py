@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox import load_config, se2
+from stereovox import load_config
 from stereovox.config.robot import AmclConfig
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import Localiser
 from stereovox.localize.scan_beams import beams_of
 from stereovox.simulate.floors.plan import FloorPlan, block

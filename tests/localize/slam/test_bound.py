@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from made_drives import box, ranges
 
-from stereovox import se2
 from stereovox.config import load_config
+from stereovox.geometry import se2
 from stereovox.localize.slam import _bound
 from stereovox.localize.slam.line_map import Cloud
 from stereovox.localize.slam.loops import ClosureSearch

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_drives import along, box, drive, ring
 
-from stereovox import se2
 from stereovox.config import load_config
+from stereovox.geometry import se2
 from stereovox.localize.slam.doubts import BENT, CONTRADICTED, MapDoubt, doubts_of
 from stereovox.localize.slam.line_map import Cloud
 from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, OdometryCheck, through

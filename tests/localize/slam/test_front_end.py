@@ -4,8 +4,8 @@
 import numpy as np
 from made_drives import along, drive, ring
 
-from stereovox import se2
 from stereovox.config import load_config
+from stereovox.geometry import se2
 from stereovox.localize.slam.front_end import MIN_NEAR_POINTS, Follower
 from stereovox.localize.slam.line_map import LineMap, joined
 

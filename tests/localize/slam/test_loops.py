@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.frame import Scan
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge
 from stereovox.localize.slam.graph import Keyframe
 from stereovox.localize.slam.line_map import Cloud, Match
 from stereovox.localize.slam.loops import SHORT_CUT, LoopFinder, Submap
 from stereovox.localize.slam.pipeline import Slam
-from stereovox.pose_graph import Edge
 
 ONE = Cloud(np.array([[1.0, 0.5]], np.float32), np.array([[-1.0, 0.0]], np.float32))
 SCAN = Scan(np.array([1.0], np.float32), 0.0, 0.1, 0.02, 8.0, np.eye(4))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from made_drives import box, ranges
 
-from stereovox import se2
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.slam.graph import in_second_frame, without_weak
 from stereovox.localize.slam.line_map import Cloud, LineMap, cloud_of, joined
 

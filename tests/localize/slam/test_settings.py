@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from made_drives import along, box, drive, ranges
 
-from stereovox import se2
 from stereovox.config import load_config
 from stereovox.config.robot import SlamConfig
 from stereovox.errors import ConfigError
 from stereovox.frame import Scan
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge
 from stereovox.localize.slam.graph import Keyframe, patch_edges
 from stereovox.localize.slam.line_map import Cloud, Match, cloud_of
 from stereovox.localize.slam.loops import ClosureSearch, LoopFinder
 from stereovox.localize.slam.pipeline import Slam, map_scans
-from stereovox.pose_graph import Edge
 
 HALL = np.vstack([box(-3, -2, 9, 3), box(1, 1, 2, 1.6), box(6, -2, 6.4, -1.5), box(-3, 0, -2.6, 1)])
 STRAIGHT = drive(HALL, along([(0, 0), (5, 0)]), limit=20.0)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_drives import along, drive, ring
 
-from stereovox import se2
 from stereovox.config import load_config
+from stereovox.geometry import se2
 from stereovox.localize.slam.pipeline import MIN_LATE_SCANS, Slam, map_scans
 
 SCANS = drive(ring(), along([(1, 1), (6, 1)]), drift=(1.03, 0.01))

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from made_segments import distance_to
 
-from stereovox import se2
 from stereovox.config import NoiseConfig
 from stereovox.errors import SourceError
 from stereovox.frame import Reason
+from stereovox.geometry import se2
+from stereovox.geometry.se3 import inverse, rigidity_error, transform_points
 from stereovox.opening import open_robot
-from stereovox.se3 import inverse, rigidity_error, transform_points
 from stereovox.sensors.noise import RangeNoise
 from stereovox.simulate.floors.drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
 from stereovox.simulate.floors.floor import PLANS, Floor

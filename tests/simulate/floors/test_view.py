@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereovox import se2
+from stereovox.geometry import se2
 from stereovox.simulate.floors.floor import Floor
 from stereovox.simulate.floors.kinect import kinect_camera
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, block, post

@@ -13,7 +13,7 @@ from stereovox.errors import SourceError
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.recording import Bag, tracker_poses
 from stereovox.sources.bags.tf import read_tf, tf_topics
-from stereovox.sources.tracker import turned
+from stereovox.sources.poses.tracker import turned
 
 ENDINGS = pytest.mark.parametrize("ending", [".bag", ".db3"])
 OPTICAL = [0.1, 0.0, 0.3, -0.5, 0.5, -0.5, 0.5]

@@ -12,8 +12,8 @@ from made_unposed import room
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_images, open_source
+from stereovox.runs.survey import survey
 from stereovox.sources.bags.writer import BagWriter
-from stereovox.survey import survey
 
 ASIDE = [0.3, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
 """The camera in the body: its y is the body's z."""

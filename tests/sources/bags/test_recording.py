@@ -9,8 +9,8 @@ import pytest
 from made_bags import START_NS, Bag, camera_info, depth, header, image, message, pose, ros_bag, stamp, text, transform
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import from_quaternion
 from stereovox.opening import open_source
-from stereovox.se3 import from_quaternion
 from stereovox.sources.bags.recording import Bag as BagSource
 
 TOPIC = "/camera/depth/image_rect_raw"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from stereovox.errors import FrameRefused
-from stereovox.se3 import inverse
+from stereovox.geometry.se3 import inverse
 from stereovox.sources.bags.tf import Limits, Tf
 
 MS = 1_000_000

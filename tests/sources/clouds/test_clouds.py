@@ -10,7 +10,7 @@ import stereovox as sv
 from stereovox.cli import main
 from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.bags.robot_messages import read_point_cloud
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.sources.poses.trajectory import write_trajectory
 
 POINTS = np.array([[1.0, 2.0, 0.5], [3.0, -1.0, 0.0], [np.nan, 0.0, 0.0]], np.float32)
 

@@ -11,9 +11,9 @@ import pytest
 from made_recordings import png_bytes
 
 from stereovox.errors import FrameRefused, SourceError
+from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.opening import SOURCES, open_source
 from stereovox.registry import find
-from stereovox.se3 import inverse, transform_points
 from stereovox.sources.lidar import LidarSource
 
 LAYOUTS = {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stereovox.evaluate.lidar_truth import project
+from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, transform_points
 
 DRIVE = (
     Path(__file__).resolve().parents[3] / "../shared/data/kitti_raw/2011_09_26/2011_09_26_drive_9001_sync"

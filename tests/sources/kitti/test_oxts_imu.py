@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_images, open_source
-from stereovox.se3 import inverse
 
 
 def drive(folder, count=3):

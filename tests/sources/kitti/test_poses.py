@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.se3 import inverse, rotation_matrix
+from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.sources.kitti.poses import UPRIGHT, FramePoses, StandingPoses, camera_poses, imu_pose, read_pose_file
 
 DEGREE_NORTH = math.radians(1) * 6378137.0

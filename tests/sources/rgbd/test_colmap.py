@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
-from stereovox.sources.rgbd.colmap import Colmap
+from stereovox.sources.rgbd.layouts.colmap import Colmap
 
 UNIT = 0.4
 """Metres of COLMAP's unit in these models."""

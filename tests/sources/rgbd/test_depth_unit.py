@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_depth import K, camera_text, matrix_line, posed, render, tum_line, units, write
 
+from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_source
-from stereovox.se3 import rotation_matrix
 from stereovox.sources.rgbd.depth_unit import UNITS, find_unit, pairs_of
 
 COUNT = 8

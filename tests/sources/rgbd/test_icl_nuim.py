@@ -6,11 +6,11 @@ import pytest
 from made_depth import VGA, check, left_handed, posed, render, tum_line, units, write
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
 from stereovox.sources.rgbd.depth_unit import difference, pairs_of
-from stereovox.sources.rgbd.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
-from stereovox.sources.rgbd.tum import TumRgbd
+from stereovox.sources.rgbd.layouts.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
+from stereovox.sources.rgbd.layouts.tum import TumRgbd
 
 
 def icl(folder, poses="livingRoom2.gt.freiburg", places=None):

@@ -9,7 +9,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.klg import KlgLog
+from stereovox.sources.rgbd.layouts.klg import KlgLog
 
 POSES = "".join(f"{0.1 * k:.6f} {0.2 * k} 0 0 0 0 0 1\n" for k in range(3))
 

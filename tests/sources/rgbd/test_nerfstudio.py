@@ -10,7 +10,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.nerfstudio import NerfTransforms
+from stereovox.sources.rgbd.layouts.nerfstudio import NerfTransforms
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 CAMERA = {"fl_x": 500.0, "fl_y": 520.0, "cx": 310.0, "cy": 250.0, "w": 640, "h": 480, "camera_model": "OPENCV"}

@@ -8,7 +8,7 @@ import pytest
 from made_depth import SMALL, VGA, K, check, posed, render, units, write
 
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.open3d import Open3DFolder
+from stereovox.sources.rgbd.layouts.open3d import Open3DFolder
 
 PRIMESENSE = (525.0, 525.0, 319.5, 239.5)
 

@@ -10,7 +10,7 @@ from made_depth import SMALL, VGA, K, camera_text, check, left_handed, posed, se
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_images, open_source
-from stereovox.sources.rgbd.icl_nuim import INTRINSICS
+from stereovox.sources.rgbd.layouts.icl_nuim import INTRINSICS
 from stereovox.sources.rgbd.packed import SensFile, SlambenchRaw
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_images, open_source
-from stereovox.sources.rgbd.polycam import Polycam
+from stereovox.sources.rgbd.layouts.polycam import Polycam
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 CX, CY = (10 * (centre + 0.5) - 0.5 for centre in (room.CX, room.CY))

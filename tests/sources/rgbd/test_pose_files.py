@@ -9,7 +9,7 @@ from made_depth import matrix_line, posed, tum_line
 from scipy.spatial.transform import Rotation
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.pose_files import (
     ImagePoses,
     image_numbers,

@@ -6,9 +6,9 @@ import pytest
 from made_depth import camera_text, check, left_handed, matrix_line, posed, render, units, write
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
-from stereovox.sources.tracker import AXES
+from stereovox.sources.poses.tracker import AXES
 
 
 def in_axes(T, axes):

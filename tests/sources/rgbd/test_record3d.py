@@ -9,7 +9,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.record3d import Record3D
+from stereovox.sources.rgbd.layouts.record3d import Record3D
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 OpenEXR = pytest.importorskip("OpenEXR")

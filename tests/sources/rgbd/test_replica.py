@@ -8,7 +8,7 @@ from made_depth import SMALL, VGA, K, check, matrix_line, posed, render, units, 
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.replica import RENDERED, Replica
+from stereovox.sources.rgbd.layouts.replica import RENDERED, Replica
 
 
 def replica(folder, K=K, size=SMALL, per_metre=6553.5, poses="traj.txt", images="results/depth{:06d}.png"):

@@ -5,9 +5,9 @@ import made_rooms as room
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
-from stereovox.sources.rgbd.rtabmap import RtabmapExport
+from stereovox.sources.rgbd.layouts.rtabmap import RtabmapExport
 
 STAMPS = [f"{1600000000 + k}.250000" for k in range(room.COUNT)]
 

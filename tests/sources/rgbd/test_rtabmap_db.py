@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source
-from stereovox.se3 import inverse
-from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
+from stereovox.sources.rgbd.layouts.rtabmap_db import RtabmapDatabase
 
 TO_NODE = inverse(room.T_BASE_CAMERA)
 

@@ -11,7 +11,7 @@ from made_recordings import depth_image, pose, seven_scenes, write_png
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
 from stereovox.sources.base import Selection
-from stereovox.sources.rgbd.seven_scenes import SevenScenes
+from stereovox.sources.rgbd.layouts.seven_scenes import SevenScenes
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
 

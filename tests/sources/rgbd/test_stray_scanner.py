@@ -7,7 +7,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.stray_scanner import StrayScanner
+from stereovox.sources.rgbd.layouts.stray_scanner import StrayScanner
 
 HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
 FACTOR = 1920 / room.SIZE[0]

@@ -6,9 +6,9 @@ import pytest
 from made_depth import camera_text, check, posed, render, units, write
 
 from stereovox.errors import SourceError
+from stereovox.geometry.se3 import interpolate
 from stereovox.opening import open_source
-from stereovox.se3 import interpolate
-from stereovox.sources.rgbd.sun3d import Sun3d
+from stereovox.sources.rgbd.layouts.sun3d import Sun3d
 
 STEP_US = 33_369
 

@@ -7,7 +7,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.tartanair import TartanAir
+from stereovox.sources.rgbd.layouts.tartanair import TartanAir
 
 NED_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # optical axes as columns: right, down, forward
 NED_WORLD = np.diag([1.0, -1, -1])

@@ -7,7 +7,7 @@ from made_recordings import SIZE, depth_image, tum, write_png
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.rgbd.tum import TumRgbd
+from stereovox.sources.rgbd.layouts.tum import TumRgbd
 
 STAMPS = ["1305031102.160407", "1305031102.194330", "1305031102.226738"]
 STRAIGHT = "".join(f"1305031102.{ms:03d} {ms / 1000} 0 1 0 0 0 1\n" for ms in range(100, 300, 10))

@@ -12,8 +12,8 @@ from made_robot_bags import MS, START_NS, RobotBagMaker, planar_motion, planar_n
 
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
+from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_robot
-from stereovox.se3 import inverse
 from stereovox.sources.robots.bag import RobotBag, mounted
 from stereovox.sources.robots.robot import in_time_order
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereovox import se2
 from stereovox.errors import SourceError
+from stereovox.geometry import se2
 from stereovox.opening import open_robot
 from stereovox.sources.robots.carmen import CarmenLog
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from stereovox.se3 import from_quaternion, inverse, transform_points
+from stereovox.geometry.se3 import from_quaternion, inverse, transform_points
 from stereovox.sources.bags.robot_messages import PointCloud
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 VALID, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(2), np.uint8(3)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)

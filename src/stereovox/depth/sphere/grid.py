@@ -16,7 +16,7 @@ from stereovox.config import Config, SphereConfig
 from stereovox.depth.sphere import _sphere
 from stereovox.depth.sphere.layout import SphereLayout, union
 from stereovox.frame import DepthImage, Reason
-from stereovox.se3 import Transform, transform_points
+from stereovox.geometry.se3 import Transform, transform_points
 from stereovox.sensors.noise import SUBPIXEL
 
 PIXEL = 1.5

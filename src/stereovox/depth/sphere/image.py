@@ -16,7 +16,7 @@ from stereovox.depth.sphere.grid import SphereGrid, accumulate
 from stereovox.depth.sphere.layout import SphereLayout
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
 
 T_BODY_GRID: Transform = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 """From the optical frame of a grid's image to the body: its x axis, the pole of all rows, points down."""

@@ -13,7 +13,7 @@ from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
-from stereovox.se3 import Transform, inverse, orthonormalise
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise
 
 
 def vehicle_grid(

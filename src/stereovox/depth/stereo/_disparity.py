@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, exact_cell, kernel
+from stereovox.kernels._jit import cell, exact_cell, kernel
 
 VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
 QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)

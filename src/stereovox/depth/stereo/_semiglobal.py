@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox._jit import cell, kernel
+from stereovox.kernels._jit import cell, kernel
 
 PLANES = 9
 """Bytes by which a pixel is compared: its gradient with the least and the most within half a pixel, the same of its

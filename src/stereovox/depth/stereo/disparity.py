@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stereovox.config import StereoConfig
 from stereovox.depth.stereo import _disparity
 from stereovox.depth.stereo.matchers import Matcher
-from stereovox.threads import in_shards, shards
+from stereovox.kernels.threads import in_shards, shards
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_] | None

@@ -14,9 +14,9 @@ from stereovox.depth.stereo.disparity import FAR_PX, Disparity, doubled, explain
 from stereovox.depth.stereo.matchers import make_matcher
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame, Reason, StereoFrame, name_of
-from stereovox.se3 import Transform
-from stereovox.threads import in_shards, shards
-from stereovox.trust.validate import matrix_of
+from stereovox.frame.validate import matrix_of
+from stereovox.geometry.se3 import Transform
+from stereovox.kernels.threads import in_shards, shards
 
 __all__ = ["Disparity", "StereoDepth"]
 

@@ -12,7 +12,7 @@ from stereovox.config import StereoConfig
 from stereovox.depth.stereo import _disparity, _semiglobal
 from stereovox.depth.stereo._semiglobal import BLOCK, MARGIN, MAX_COST, PLANES, RIM, Settings, StripScratch
 from stereovox.errors import ConfigError
-from stereovox.threads import Scratch, in_shards, shards
+from stereovox.kernels.threads import Scratch, in_shards, shards
 
 Image = NDArray[np.uint8]
 COUNTS = 16

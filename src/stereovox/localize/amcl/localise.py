@@ -16,18 +16,18 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.config import Config
 from stereovox.depth.quality import check_scan
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError
 from stereovox.frame import Scan, name_of
+from stereovox.frame.validate import validate_scan
+from stereovox.geometry import se2
 from stereovox.localize.amcl.models import MODELS, moved, turn_go_turn
 from stereovox.localize.amcl.particles import Clusters, Recovery, draw, mean_pose, spread
 from stereovox.localize.scan_beams import Beams, beams_of
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
-from stereovox.trust.validate import validate_scan
 
 LATE = 3
 """Late scans in a row, in order among themselves, before it is decided which stamps are wrong."""

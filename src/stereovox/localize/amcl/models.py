@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.config.robot import AmclConfig
+from stereovox.geometry import se2
 from stereovox.localize.amcl import _amcl
 from stereovox.localize.scan_beams import Beams
 from stereovox.maps.occupancy import OccupancyGrid

@@ -8,10 +8,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.config.robot import AmclConfig
+from stereovox.geometry import se2
+from stereovox.geometry.se2 import Pose
 from stereovox.localize.amcl import _amcl
-from stereovox.se2 import Pose
 
 NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
 """Half of a bin's 26 neighbours: the other half has the bin among theirs."""

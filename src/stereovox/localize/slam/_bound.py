@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell, kernel
+from stereovox.kernels._jit import allocating_kernel, cell, kernel
 
 ZERO = np.float32(0)
 

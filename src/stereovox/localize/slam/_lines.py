@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import kernel
+from stereovox.kernels._jit import kernel
 
 ZERO, HALF, ONE, TWO, FOUR = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2), np.float32(4)
 TINY = np.float32(1e-12)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import allocating_kernel, cell
+from stereovox.kernels._jit import allocating_kernel, cell
 
 ZERO, ONE = np.float32(0), np.float32(1)
 FACING = np.float32(0.05)

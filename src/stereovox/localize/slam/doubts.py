@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge
 from stereovox.localize.slam.graph import Keyframe
 from stereovox.localize.slam.odometry_check import through
-from stereovox.pose_graph import Edge
 
 BLOCK, EVERY = 10, 2
 """Keyframes that are judged together, and the step between those of them that are looked at."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.slam.graph import SLACK_TURN, Keyframe
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
 from stereovox.localize.slam.loops import ClosureSearch

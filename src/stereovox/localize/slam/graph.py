@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge
 from stereovox.localize.slam.line_map import Cloud, LineMap, joined
-from stereovox.pose_graph import Edge
 
 STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
 """Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.frame import Scan
+from stereovox.geometry import se2
 from stereovox.localize.slam import _lines, _match
 
 NEAR = 0.15

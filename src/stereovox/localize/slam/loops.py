@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.config.robot import SlamConfig
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge
 from stereovox.localize.slam import _bound
 from stereovox.localize.slam.graph import Keyframe, in_second_frame
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, joined
-from stereovox.pose_graph import Edge
 
 COARSE = 2
 """Cells of the map on the side of one cell of the search."""

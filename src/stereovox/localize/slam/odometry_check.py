@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
+from stereovox.geometry import se2
 from stereovox.localize.slam.line_map import Cloud
 
 COMPARED_PATH, COMPARED_SCANS = 1.0, 20

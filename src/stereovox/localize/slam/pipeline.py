@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.config import Config, load_config
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Scan
+from stereovox.geometry import se2
+from stereovox.geometry.pose_graph import Edge, PoseGraph
 from stereovox.integrate.beams import make_beams
 from stereovox.localize.slam.doubts import MapDoubt, doubts_of
 from stereovox.localize.slam.front_end import Follower
@@ -28,7 +29,6 @@ from stereovox.localize.slam.loops import LoopFinder
 from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.pose_graph import Edge, PoseGraph
 
 MIN_LATE_SCANS = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""

@@ -9,10 +9,10 @@ from heapq import merge
 
 import numpy as np
 
-from stereovox import se2
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
-from stereovox.se3 import Transform
+from stereovox.geometry import se2
+from stereovox.geometry.se3 import Transform
 from stereovox.simulate.floors.floor import Floor
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.robots.robot import Robot

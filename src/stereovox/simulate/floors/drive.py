@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.se2 import Pose, compose, relative, wrapped
+from stereovox.geometry.se2 import Pose, compose, relative, wrapped
 
 STEP_NS = 20_000_000
 """Time between two poses of a drive."""

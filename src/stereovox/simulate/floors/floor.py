@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import registry, se2
+from stereovox import registry
 from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Reason, Scan
+from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.simulate.d435 import classify
 from stereovox.simulate.floors.drive import STEP_NS, Odometry, drive
@@ -23,7 +24,7 @@ from stereovox.simulate.floors.view import LevelView, cast, with_lids
 from stereovox.simulate.stage import one_of, within
 from stereovox.sources import parameters
 from stereovox.sources.base import Lazy
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 PLANS = {
     "corridors": "stereovox.simulate.floors.layouts:corridors",

@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import se2
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, Obstacle
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import read_bounded, yaml_value
+from stereovox.files.safe_io import read_bounded, yaml_value
 from stereovox.sources.bags.files import BagFile, one_line
 from stereovox.sources.bags.messages import Wire
 

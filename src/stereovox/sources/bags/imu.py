@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.bags.depth_topic import Metadata
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import Wire, ns_from_ms

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Photo
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.bags.depth_topic import (
     CAMERA_INFO,
     COMPRESSED,

@@ -14,8 +14,8 @@ from stereovox.sources.bags.depth_topic import Metadata
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import POSE_TYPES, StampedPose, ns_from_ms, read_pose
 from stereovox.sources.bags.tf import TfPoses, read_tf, tf_poses
-from stereovox.sources.poses import Poses
-from stereovox.sources.trajectory import transforms
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.trajectory import transforms
 
 T265 = re.compile(r"(/device_\d+/sensor_\d+/Pose_\d+/pose)/transform/data")
 """A geometry_msgs/Transform without a time: that is in the metadata, with the confidence."""

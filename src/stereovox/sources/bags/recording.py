@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
@@ -25,8 +25,8 @@ from stereovox.sources.bags.poses import find_poses
 from stereovox.sources.bags.tf import Tf, TfPoses, read_tf
 from stereovox.sources.base import DepthSource
 from stereovox.sources.imu import ImuReadings
-from stereovox.sources.poses import Poses
-from stereovox.sources.tracker import AXES, WORLDS, turned
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import AXES, WORLDS, turned
 
 STANDING = ("", "fixed")
 OptionsT = TypeVar("OptionsT")

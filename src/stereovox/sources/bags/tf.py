@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
-from stereovox.se3 import Transform, from_quaternion, interpolate, inverse
+from stereovox.geometry.se3 import Transform, from_quaternion, interpolate, inverse
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.robot_messages import TF_TYPES, frame_name, is_motion, read_transforms
-from stereovox.sources.poses import seconds_from_ns
+from stereovox.sources.poses.poses import seconds_from_ns
 
 STILL = 1e-9
 WORLDS = ("map", "odom")

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, SourceError
+from stereovox.files.safe_io import check_local, short_name, sync_file, sync_folder, sync_tree
 from stereovox.frame import Frame, Scan
+from stereovox.geometry.se2 import lifted
+from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.safe_io import check_local, short_name, sync_file, sync_folder, sync_tree
-from stereovox.se2 import lifted
-from stereovox.se3 import Transform, rigidity_error
 from stereovox.sources.bags.depth_topic import sibling
 from stereovox.sources.bags.files import UNFINISHED, one_line
 from stereovox.sources.bags.writer_messages import Messages, metres, millimetres, packed_png

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Frame, Scan
+from stereovox.geometry.se2 import lifted
+from stereovox.geometry.se3 import Transform, rotation_vector
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.se2 import lifted
-from stereovox.se3 import Transform, rotation_vector
 
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, MapFileError, NoPoses, SourceError, did_you_mean
 from stereovox.frame import Cloud
+from stereovox.frame.validate import MAX_INT
 from stereovox.sources.base import Part
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.images import file_names
 from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.parameters import file_of
 from stereovox.sources.point_files import read_points
+from stereovox.sources.poses.tracker import AXES
+from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig_options import poses_of_images
-from stereovox.sources.tracker import AXES
-from stereovox.sources.trajectory import ns_from_seconds
-from stereovox.trust.validate import MAX_INT
+from stereovox.sources.rigs.rig_options import poses_of_images
 
 ENDINGS = (".pcd", ".ply", ".bin")
 SUBFOLDERS = ("", "clouds", "scans", "velodyne", "velodyne_points/data", "lidar", "pcd", "ply", "points")

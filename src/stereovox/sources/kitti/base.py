@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.files.safe_io import MAX_LIST, read_text
 from stereovox.frame import StereoFrame, Viewpoint
-from stereovox.safe_io import MAX_LIST, read_text
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.base import Source
 from stereovox.sources.images import PICTURE_KINDS, common_size, file_names, read_picture_png
 from stereovox.sources.kitti.calibration import KittiCalibration

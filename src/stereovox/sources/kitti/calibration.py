@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError, StereovoxError
-from stereovox.safe_io import read_text
-from stereovox.se3 import Transform, orthonormalise, rigidity_error
+from stereovox.files.safe_io import read_text
+from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error
 
 CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
 ROUNDING = 1e-3

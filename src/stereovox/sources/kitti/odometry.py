@@ -19,10 +19,10 @@ from stereovox.sources.kitti.base import (
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
 from stereovox.sources.kitti.poses import FramePoses, read_named_poses
 from stereovox.sources.parameters import file_of
-from stereovox.sources.poses import UnknownPoses
+from stereovox.sources.poses.poses import UnknownPoses
+from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig_options import POSES, folder_and_options
-from stereovox.sources.trajectory import ns_from_seconds
+from stereovox.sources.rigs.rig_options import POSES, folder_and_options
 
 IMAGE = re.compile(r"(\d{6})\.png")
 CALIBRATION, TIMES = "calib.txt", "times.txt"

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import MAX_LIST, read_text
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
-from stereovox.sources.poses import Poses
+from stereovox.files.safe_io import MAX_LIST, read_text
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
+from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.pose_files import in_optical_axes
-from stereovox.sources.rig_options import poses_of_images
+from stereovox.sources.rigs.rig_options import poses_of_images
 
 EARTH_RADIUS = 6378137.0
 """Metres, as KITTI's own development kit has it."""

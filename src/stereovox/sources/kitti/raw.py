@@ -22,9 +22,9 @@ from stereovox.sources.kitti.base import (
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
 from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files, read_oxts_motions
 from stereovox.sources.parameters import file_of
-from stereovox.sources.poses import UnknownPoses
+from stereovox.sources.poses.poses import UnknownPoses
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig_options import POSES, folder_and_options
+from stereovox.sources.rigs.rig_options import POSES, folder_and_options
 
 IMAGE = re.compile(r"(\d{10})\.png")
 REFINED, INS, OXTS = "poses_refined.txt", "poses_ins.txt", "oxts"

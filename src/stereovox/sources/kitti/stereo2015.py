@@ -18,7 +18,7 @@ from stereovox.sources.kitti.base import KittiSource, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, from_raw_files, read_calibration
 from stereovox.sources.kitti.poses import StandingPoses
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig_options import folder_and_options
+from stereovox.sources.rigs.rig_options import folder_and_options
 
 SCENE = re.compile(r"(\d{6})_10\.png")
 LEFT, RIGHT, MOVING = "image_2", "image_3", "obj_map"

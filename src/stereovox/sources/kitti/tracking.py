@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MAX_LIST, read_text
-from stereovox.se3 import Transform
+from stereovox.files.safe_io import MAX_LIST, read_text
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.kitti.base import KittiSource, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
 from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_file
 from stereovox.sources.lidar import Box
 from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rig_options import POSES, folder_and_options
+from stereovox.sources.rigs.rig_options import POSES, folder_and_options
 
 FIELDS = 17
 """frame, track, kind, truncated, occluded, alpha, 4 of the 2-D box, h, w, l, x, y, z, rotation_y; perhaps a score."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import FrameRefused
-from stereovox.safe_io import read_bounded
+from stereovox.files.safe_io import read_bounded
 from stereovox.sources.images import MAX_BYTES, decode_png
 from stereovox.sources.rgbd.depth_files import Depth
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import MAX_PIXELS
 from stereovox.errors import FrameRefused, MissingExtra
-from stereovox.safe_io import read_bounded
+from stereovox.files.safe_io import read_bounded
 from stereovox.sources.images import GREY_16, MAX_BYTES, SIGNATURE, decode_png, size_text, spread
 
 SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
-from stereovox.se3 import Transform, apart, inverse
+from stereovox.geometry.se3 import Transform, apart, inverse
 from stereovox.sources.rgbd.depth_files import Depth
 
 UNITS = {

@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.frame import Frame, Photo
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.base import DepthSource
-from stereovox.sources.camera_file import FoundCamera, Standard, camera_in, find_camera
+from stereovox.sources.calibration.camera_file import FoundCamera, Standard, camera_in, find_camera
+from stereovox.sources.calibration.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.images import file_names
-from stereovox.sources.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
 from stereovox.sources.photos import nearest_in_time, photo_size, read_photo, registered
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import AXES
+from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
 from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, in_other_hand, number_in, read_poses
 from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
-from stereovox.sources.tracker import AXES
-from stereovox.sources.trajectory import ns_from_seconds
 
 SECOND = 1_000_000_000
 PHOTO_NS, PHOTOS_TRIED = 20_000_000, 5

@@ -14,14 +14,14 @@ import numpy as np
 
 from stereovox.cameras.pinhole import MAX_PIXELS
 from stereovox.errors import FrameRefused, NoPoses, SourceError
-from stereovox.se3 import Transform
-from stereovox.sources.camera_file import FoundCamera, find_camera, pinhole
-from stereovox.sources.intrinsics import Intrinsics, metres_per_unit
-from stereovox.sources.poses import Poses
+from stereovox.geometry.se3 import Transform
+from stereovox.sources.calibration.camera_file import FoundCamera, find_camera, pinhole
+from stereovox.sources.calibration.intrinsics import Intrinsics, metres_per_unit
+from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
-from stereovox.sources.rgbd.icl_nuim import INTRINSICS
-from stereovox.sources.rgbd.icl_nuim import POSES as ICL_POSES
+from stereovox.sources.rgbd.layouts.icl_nuim import INTRINSICS
+from stereovox.sources.rgbd.layouts.icl_nuim import POSES as ICL_POSES
 from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
 
 VERSION, MAX_NAME = 4, 1 << 12

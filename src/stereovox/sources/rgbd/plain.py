@@ -9,10 +9,10 @@ from pathlib import Path
 
 from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
-from stereovox.sources.camera_file import FoundCamera, find_camera
-from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.calibration.camera_file import FoundCamera, find_camera
+from stereovox.sources.calibration.intrinsics import NAMES
 from stereovox.sources.photos import FOLDERS, photo_size
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, common_depth_size
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in, photos_in
 from stereovox.sources.rgbd.pose_files import ImagePoses, read_pose_folder, read_poses

@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import MAX_LIST, is_number, read_bounded, read_json, read_text
-from stereovox.se3 import Transform, from_quaternion, inverse
-from stereovox.sources.poses import Poses
-from stereovox.sources.tracker import AXES
-from stereovox.sources.trajectory import Trajectory
+from stereovox.files.safe_io import MAX_LIST, is_number, read_bounded, read_json, read_text
+from stereovox.geometry.se3 import Transform, from_quaternion, inverse
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import AXES
+from stereovox.sources.poses.trajectory import Trajectory
 
 FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
 MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])

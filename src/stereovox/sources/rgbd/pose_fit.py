@@ -15,11 +15,11 @@ import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
-from stereovox.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, inverse
+from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.depth_unit import View, difference, find_unit, is_likely, pairs_of
 from stereovox.sources.rgbd.pose_files import in_optical_axes, in_other_hand
-from stereovox.sources.tracker import AXES
 
 POSE_SCALES = (1.0, 0.001, 0.01)
 """Metres per unit of poses that are tried."""

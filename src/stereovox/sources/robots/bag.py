@@ -11,7 +11,7 @@ import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame, Scan
-from stereovox.se3 import Transform, inverse, rotation_matrix
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, depth_topics, find_depth
 from stereovox.sources.bags.files import BagFile
@@ -21,10 +21,10 @@ from stereovox.sources.bags.robot_messages import LaserScan, frame_name
 from stereovox.sources.bags.scans import busiest_topic, find_scans
 from stereovox.sources.bags.tf import Limits
 from stereovox.sources.base import Lazy
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 from stereovox.sources.robots.frames import FrameOptions, RobotFrames
-from stereovox.sources.tracker import AXES
 
 NO_POSE = np.full((4, 4), np.nan)
 T_BODY_OPTICAL = np.eye(4)

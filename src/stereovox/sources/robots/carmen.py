@@ -15,12 +15,12 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import se2
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
-from stereovox.se2 import lifted
+from stereovox.geometry import se2
+from stereovox.geometry.se2 import lifted
 from stereovox.sources import parameters
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
 """Line types with a scan of the front laser, and the largest distance in metres of its mount from the robot."""

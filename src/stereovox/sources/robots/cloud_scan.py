@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.se2 import flattened, lifted
-from stereovox.se3 import Transform, inverse, transform_points
+from stereovox.geometry.se2 import flattened, lifted
+from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.sources.bags.robot_messages import LaserScan, PointCloud
 
 

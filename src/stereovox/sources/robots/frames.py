@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
-from stereovox.se3 import Transform
+from stereovox.geometry.se3 import Transform
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.robot_messages import frame_name
 from stereovox.sources.bags.scans import first_odometry, odometry_edge, odometry_topic

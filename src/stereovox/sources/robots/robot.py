@@ -8,7 +8,7 @@ from heapq import merge
 from typing import Protocol
 
 from stereovox.frame import Frame, Scan
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses.poses import Poses
 
 
 class Robot(Protocol):

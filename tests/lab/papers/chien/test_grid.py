@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.lab.papers.chien.boxes import Placement, find_boxes
-from stereovox.lab.papers.chien.grid import CHOSEN, MODELS, SHARE, Extent, Setting, box_width, chapter, widths_over_grid
 from stereovox.maps import VoxelMap
+from stereovox_lab.papers.chien.boxes import Placement, find_boxes
+from stereovox_lab.papers.chien.grid import CHOSEN, MODELS, SHARE, Extent, Setting, box_width, chapter, widths_over_grid
 
 SMALL = Extent((CHOSEN,), (0.2,), ((0.0, 0.0), (0.5, 0.0)), (0.08,), (4, 8), ("line",))
 

@@ -8,13 +8,13 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.cells import indices, keys
 from stereovox.evaluate.truth import touched_cells
-from stereovox.lab.papers.chien.apartment import Scan, scan_apartment
-from stereovox.lab.papers.chien.rooms import grown, measure_face, measure_rooms, outer_corners
 from stereovox.maps import VoxelMap
 from stereovox.simulate.recorder import OPENGL, follow
 from stereovox.simulate.scene import box
 from stereovox.simulate.simulation import Simulation
 from stereovox.simulate.t265 import T265
+from stereovox_lab.papers.chien.apartment import Scan, scan_apartment
+from stereovox_lab.papers.chien.rooms import grown, measure_face, measure_rooms, outer_corners
 
 SIZE = 0.05
 

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from stereovox.lab.papers.chien.shifting import OUTSIDE, fly
+from stereovox_lab.papers.chien.shifting import OUTSIDE, fly
 
 
 @pytest.fixture(scope="module")

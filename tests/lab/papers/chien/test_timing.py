@@ -3,8 +3,8 @@
 
 import pytest
 
-from stereovox.lab.papers.chien import timing as told
-from stereovox.lab.papers.chien.timing import CONDITIONS, STEPS, processor, time_tables
+from stereovox_lab.papers.chien import timing as told
+from stereovox_lab.papers.chien.timing import CONDITIONS, STEPS, processor, time_tables
 
 
 @pytest.fixture(scope="module")

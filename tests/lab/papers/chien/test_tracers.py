@@ -8,8 +8,8 @@ from stereovox.depth import prepare
 from stereovox.evaluate.cells import keys
 from stereovox.frame import Frame
 from stereovox.integrate import make_integrator
-from stereovox.lab.papers.chien.tracers import RIM_CELLS, compare_tracers, near_rim, updated_cells
-from stereovox.maps.evidence import Evidence
+from stereovox.maps.cells.evidence import Evidence
+from stereovox_lab.papers.chien.tracers import RIM_CELLS, compare_tracers, near_rim, updated_cells
 
 
 def test_updated_cells_are_those_that_get_something():

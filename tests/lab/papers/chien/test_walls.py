@@ -7,9 +7,9 @@ import pytest
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.cells import keys
-from stereovox.lab.papers.chien.walls import Wall, corner_deg, fit_plane, measure_wall, thickness_figures
 from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import box, cylinder
+from stereovox_lab.papers.chien.walls import Wall, corner_deg, fit_plane, measure_wall, thickness_figures
 
 SIZE = 0.05
 SOLID = box("walls", "front", (2.02, -1.0, 0.0), (2.3, 1.0, 2.0))

@@ -14,12 +14,13 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.curves import EXACT, TOLERANT, PrecisionRecall
 from stereovox.evaluate.scores import score
 from stereovox.frame import Frame, Reason
-from stereovox.lab.papers.valenti.apart import Apart, apart
-from stereovox.lab.papers.valenti.claims import CLAIMED, claims_of, results, speed_claim
-from stereovox.lab.papers.valenti.course import course_claims, rank_correlation
-from stereovox.lab.papers.valenti.figures import THRESHOLDS, at
-from stereovox.lab.papers.valenti.judge import Judged
-from stereovox.lab.papers.valenti.mappers import (
+from stereovox.maps import State
+from stereovox_lab.papers.valenti.apart import Apart, apart
+from stereovox_lab.papers.valenti.claims import CLAIMED, claims_of, results, speed_claim
+from stereovox_lab.papers.valenti.course import course_claims, rank_correlation
+from stereovox_lab.papers.valenti.figures import THRESHOLDS, at
+from stereovox_lab.papers.valenti.judge import Judged
+from stereovox_lab.papers.valenti.mappers import (
     DEFAULT,
     OCTOMAP,
     THESIS,
@@ -28,7 +29,7 @@ from stereovox.lab.papers.valenti.mappers import (
     Setting,
     config_of,
 )
-from stereovox.lab.papers.valenti.printed import (
+from stereovox_lab.papers.valenti.printed import (
     BEST,
     PRINTED,
     RATES,
@@ -41,10 +42,9 @@ from stereovox.lab.papers.valenti.printed import (
     no_worse,
     own_claims,
 )
-from stereovox.lab.papers.valenti.recordings import find_drives
-from stereovox.lab.papers.valenti.speed import Speed
-from stereovox.lab.papers.valenti.street import GAP_M, halves
-from stereovox.maps import State
+from stereovox_lab.papers.valenti.recordings import find_drives
+from stereovox_lab.papers.valenti.speed import Speed
+from stereovox_lab.papers.valenti.street import GAP_M, halves
 
 SETTING = Setting(0.5, 20.0)
 CELLS = np.array([[x, y, 0] for x in range(30) for y in range(30)])

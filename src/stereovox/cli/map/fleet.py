@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
+
+RECORDING is what `map` takes, a pattern ('drives/*'), a list (@drives.txt: a recording in each line, and the file of
+its corrected poses if there is one, from where the list is) or an s3:// prefix. The map does not depend on workers or
+boxes. What is done stays: --resume does what is missing, and what other recordings or poses change.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.options import add_settings, overrides
+from stereovox.cli.terminal import (
+    but_few,
+    cells_line,
+    command_line,
+    progress_of_steps,
+    say,
+    say_about_compiling,
+    size,
+)
+from stereovox.descriptions.description import many
+
+if TYPE_CHECKING:
+    from stereovox.fleet import FleetMap, FleetPlan
+
+EXAMPLE = "stereovox fleet recordings/monday recordings/tuesday --out town.svox"
+SHOWN = 5
+"""Recordings with refused frames that are listed."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "recordings", metavar="RECORDING", nargs="+", help="recordings, patterns, @lists, s3:// prefixes"
+    )
+    parser.add_argument("--out", metavar="MAP", required=True, help="folder or s3://bucket/NAME.svox of the map")
+    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default: as before, or default)")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 or 512 cells, by reach)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
+    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")
+    parser.add_argument("--resume", action="store_true", help="go on with the map at --out, for these recordings")
+    parser.add_argument("--plan", action="store_true", help="say what it will cost, and do nothing")
+    add_settings(parser, "sensor.model=andert")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Map the recordings and print what each gave."""
+    from stereovox.fleet import map_fleet, plan_fleet
+
+    settings = {"profile": arguments.profile, "box_m": arguments.box, **overrides(arguments)}
+    say_about_compiling()
+    if arguments.plan:
+        with progress_of_steps("looking at recordings") as progress:
+            plan = plan_fleet(arguments.recordings, progress=progress, **settings)
+        _say_plan(plan)
+        return plan.summary()
+    with progress_of_steps("recordings") as progress:
+        made = map_fleet(
+            arguments.recordings, arguments.out, resume=arguments.resume, workers=arguments.workers,
+            scheduler=arguments.scheduler, progress=progress, notify=say, **settings,
+        )  # fmt: skip
+    _say_map(made)
+    return {**made.summary(), **made.map.counts(), "out": made.out}
+
+
+def _say_plan(plan: FleetPlan) -> None:
+    say(f"{many(plan.frames, 'frame')} of {many(plan.recordings, 'recording')}")
+    say(f"at least {_boxes(plan.boxes)} of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
+    say(f"{size(plan.bytes)} of depth images to keep; {_time(plan.core_hours)} of a core like one of this machine")
+    for line in plan.unreadable:
+        say(f"cannot be read: {line}")
+
+
+def _boxes(number: int) -> str:
+    return "1 box" if number == 1 else f"{number:,} boxes"
+
+
+def _time(hours: float) -> str:
+    """Say how long, in the unit that has figures before the point."""
+    if hours < 1 / 60:
+        return f"{3600 * hours:.2g} s"
+    return f"{60 * hours:.2g} minutes" if hours < 1 else f"{hours:.2g} hours"
+
+
+def _say_map(made: FleetMap) -> None:
+    boxes, mapped = made.boxes
+    for one in made.recordings:
+        if one.error:
+            say(f"left out: {one.recording}: {one.error}")
+    refused = [one for one in made.recordings if one.refused]
+    for one in refused[:SHOWN]:
+        why = ", ".join(f"{number} x {reason}" for reason, number in one.refused.items())
+        say(f"{one.recording}: {many(one.frames, 'frame')}, refused: {why}")
+    if len(refused) > SHOWN:
+        say(f"and {many(len(refused) - SHOWN, 'recording')} more with refused frames (--json)")
+    frames, were = many(made.map.frames, "frame"), "was" if mapped == 1 else "were"
+    say(f"{frames}, each in {made.overlap:.1f} of {_boxes(boxes)}, {mapped} of which {were} mapped now")
+    say(cells_line({**made.map.counts(), "memory_bytes": made.map.memory_bytes}))
+    say(f"saved in {made.out}{but_few(made.summary())}; look at it with: {command_line('view', made.out)}")

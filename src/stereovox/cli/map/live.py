@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map cameras that are connected now, with poses as they come.
+
+SOURCE is a camera (realsense: or realsense:SERIAL), a file of several (live.toml), or a recording or simulation, which
+is played at its own pace as if it were a camera. Poses come from the images themselves, a T265, or another program
+that sends lines 'stamp tx ty tz qx qy qz qw'. Ctrl-C ends and saves.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.options import add_checkpoint, add_settings, check_ending, heights_of, overrides
+from stereovox.cli.terminal import (
+    but_few,
+    cells_line,
+    command_line,
+    milliseconds,
+    progress_of,
+    say,
+    say_about_compiling,
+    say_refusals,
+)
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.live.rig import LiveCamera
+    from stereovox.live.run import LiveResult
+
+EXAMPLE = "stereovox live realsense: --poses udp://:5005 --out room.svox --view"
+PORT = 8080
+WAIT_S = 0.3
+"""Copy of `live.stream.WAIT_S`, so that `--help` need not import it."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("source", metavar="SOURCE", help="realsense:, a live.toml, or a recording or simulation")
+    parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write")
+    about = "track: by the first camera's images; given: those of a recording; t265; udp://[HOST]:PORT or"
+    parser.add_argument(
+        "--poses", metavar="FROM",
+        help=f"{about} tcp://HOST:PORT: lines, axes behind ?axes=; mavlink:URL: an autopilot's (given, else track)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--mount", metavar="X,Y,Z,ROLL,PITCH,YAW",
+        help="where the camera is on the body (x forward, y left, z up): metres and degrees (at its origin, ahead)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--clock-offset", type=float, metavar="S", help="image stamp minus the stamp of a pose at that moment (0)"
+    )
+    parser.add_argument(
+        "--wait", type=float, default=WAIT_S, metavar="S", help=f"how long an image waits for its pose ({WAIT_S:g})"
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="how long to map (until Ctrl-C)")
+    parser.add_argument("--grid", metavar="FILE.yaml", help="2-D map (map_server) to keep up to date")
+    parser.add_argument(
+        "--heights", metavar="LO:HI", help="metres above the floor that a robot occupies (scan.heights)"
+    )
+    parser.add_argument("--sphere", metavar="FILE.png", help="picture of the distances all round, at the end")
+    parser.add_argument("--record", metavar="FILE.mcap", help="record depth images and poses beside (.bag, .db3)")
+    parser.add_argument(
+        "--view", type=int, nargs="?", const=PORT, metavar="PORT",
+        help=f"show the map in a browser while it grows ({PORT}; 0: any free port)",
+    )  # fmt: skip
+    about = "tell an autopilot at this address (udpout:127.0.0.1:14540) of obstacles: OBSTACLE_DISTANCE"
+    parser.add_argument("--mavlink", metavar="URL", help=about)
+    parser.add_argument("--resume", action="store_true", help="continue the map at --out, in the world of its poses")
+    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
+    add_settings(parser, "deadline_ms=25")
+    add_checkpoint(parser)
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Map until Ctrl-C or SIGTERM, save the map and print a summary."""
+    from stereovox.live.run import LiveRun
+
+    check_ending("--sphere", arguments.sphere, ".png")
+    given = {"poses": arguments.poses, "profile": arguments.profile, "resume": arguments.resume}
+    given |= {"wait_s": arguments.wait, "seconds": arguments.seconds, "checkpoint_s": arguments.checkpoint}
+    live = LiveRun(_cameras(arguments), arguments.out, **given, notify=say, **overrides(arguments))
+    with live, ExitStack() as stack:
+        say_about_compiling()
+        if arguments.view is not None:
+            from stereovox.cli.look.view import silence_server_log
+
+            silence_server_log()
+        live.add_outputs(
+            grid=arguments.grid, heights=heights_of(arguments.heights), sphere=arguments.sphere,
+            record=arguments.record, view=arguments.view, mavlink=arguments.mavlink,
+        )  # fmt: skip
+        if live.page:
+            say(f"open {live.page} in a browser to see the map grow")
+        say("mapping; Ctrl-C ends")
+        done = live.finish([stack.enter_context(progress_of(None, "mapping"))])
+    result = done.summary()
+    _print_result(result, done, arguments)
+    return result
+
+
+def _cameras(arguments: Namespace) -> str | LiveCamera:
+    """Return the cameras; raises StereovoxError for a mount beside a file of several."""
+    from stereovox.live.rig import LiveCamera, mount_of
+
+    if arguments.mount is None and arguments.clock_offset is None:
+        return arguments.source
+    if arguments.source.endswith(".toml"):
+        raise StereovoxError("--mount, --clock-offset: write them into the file, for each camera")
+    given: dict[str, Any] = {}
+    if arguments.mount is not None:
+        try:
+            given["T_body_camera"] = mount_of([float(word) for word in arguments.mount.split(",")])
+        except ValueError as error:
+            cure = error if isinstance(error, StereovoxError) else "write X,Y,Z,ROLL,PITCH,YAW in metres and degrees"
+            raise StereovoxError(f"--mount {arguments.mount}: {cure}") from None
+    if arguments.clock_offset is not None:
+        given["clock_offset_s"] = arguments.clock_offset
+    return LiveCamera(arguments.source, **given)
+
+
+def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace) -> None:
+    live = result["live"]
+    say_refusals(result, done.reports, "images")
+    for name, counts in live["cameras"].items():
+        lost = f"{counts['dropped']} dropped"
+        early = f", {counts['before_first_pose']} before the first pose" if counts["before_first_pose"] else ""
+        slow = f", {counts['late']} of them late: it cannot be played at its pace" if counts.get("late") else ""
+        failed = f"; failed: {counts['failure']}" if "failure" in counts else ""
+        say(f"  {name}: {counts['received']} images came, {lost}{early}{slow}{failed}")
+    if "poses" in live:
+        say(f"poses of {result['poses']}: {', '.join(f'{count} {what}' for what, count in live['poses'].items())}")
+    latency = live["latency_ms"]
+    say(f"from {latency['since']} of an image to the map: {milliseconds(latency['map'])}")
+    say(f"and until the outputs have it: {milliseconds(latency['outputs'])}")
+    say(f"{100 * live['cpu_share']:.0f} % of a core for {live['seconds']:.1f} s")
+    failures = result.get("not_written", ())
+    for what, file in (("2-D map", arguments.grid), ("distances all round", arguments.sphere)):
+        if file and not any(why.startswith(f"{file}:") for why in failures):
+            say(f"{what}: {file}")
+    if "obstacle_distances" in live:
+        say(f"{live['obstacle_distances']} obstacle distances sent to {arguments.mavlink}")
+    if "recorded" in live and not any(why.startswith(f"{arguments.record}:") for why in failures):
+        counts = ", ".join(f"{count} {what}" for what, count in live["recorded"].items()) or "nothing"
+        say(f"recorded in {arguments.record}: {counts}")
+    say(cells_line(result))
+    for why in failures:
+        say(f"not written: {why}")
+    say(f"saved in {arguments.out}{but_few(result)}; look at it with: {command_line('view', arguments.out)}")

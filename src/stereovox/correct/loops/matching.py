@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether two submaps show one place: each is laid onto the other, and both must say the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.correct.loops.submaps import Shape
+from stereovox.geometry.se3 import Transform, inverse
+from stereovox.track.fit import Stage, deviations, motion_between, settled
+from stereovox.track.surfels import CONVERGED, Level, Patches, SurfelMap
+from stereovox.track.views import View, contradiction
+
+FLOOR = np.diag(np.repeat([np.radians(0.3), 0.01], 3) ** 2)
+"""Covariance that is added to that of a match: submaps are not quite rigid."""
+DOUBT = np.diag(np.repeat([0.15, 0.4], 3) ** 2)
+"""Covariance of where a match begins: wide, so that it adds nothing to what surfaces say."""
+LEVELS = 3
+"""Sizes of surfels that are used, from the coarsest: the finest are too few in a few frames."""
+SHARED = 0.25
+"""Share of each submap's surface that the other must have seen."""
+USUAL = 0.8
+"""Share of that that must lie where the other saw it."""
+LOOKED_THROUGH, CLOSE = 0.05, 0.6
+"""Share of what both saw that may lie where the other looked through, by more than so many of its deviations."""
+MUTUAL = 30.0
+"""Squared deviations, of six, by which the two ways of laying them may differ."""
+HELD_RAD, HELD_M = np.radians(2), 0.04
+"""Standard deviations beyond which a match is open along some direction, as in a corridor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """How a submap lies on an earlier one.
+
+    Attributes:
+        T_earlier_later: (4, 4).
+        covariance: (6, 6) of it: rotation and shift in the later one's axes.
+        shared: Share of the surface of either that the other has seen.
+        held: Whether surfaces hold it in all directions.
+    """
+
+    T_earlier_later: Transform
+    covariance: NDArray[np.float64]
+    shared: float
+    held: bool
+
+
+class _Laid(NamedTuple):
+    T: Transform
+    covariance: NDArray[np.float64]
+    shared: float
+
+
+def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
+    """Return how a submap lies on an earlier one near T_earlier_later (4, 4); None where they do not show one place."""
+    there = _laid(earlier.surfels, later.patches, guess)
+    back = None if there is None else _laid(later.surfels, earlier.patches, inverse(there.T))
+    if there is None or back is None:
+        return None
+    covariance = there.covariance + FLOOR
+    apart = motion_between(there.T, inverse(back.T))
+    by_both = covariance + _seen_from(there.T, back.covariance) + FLOOR
+    if apart @ np.linalg.solve(by_both, apart) > MUTUAL:
+        return None
+    if _looked_through(earlier.views, later.views, there.T) > LOOKED_THROUGH:
+        return None
+    turn, shift = deviations(covariance)
+    is_held = turn < HELD_RAD and shift < HELD_M
+    return Match(there.T, _own_axes(covariance, there.T), min(there.shared, back.shared), is_held)
+
+
+def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | None:
+    """Return the pose that lays patches onto surfels; None where too few have one, or lie where it is."""
+    levels = surfels.levels(patches)[:LEVELS]
+    middle = levels[1]
+
+    def stages() -> Iterator[Stage]:
+        for level in levels:
+            yield Stage(level, CONVERGED * level.size)
+            if level is middle and not _is_one_place(middle):
+                return  # the finer ones, which take longest, would be for nothing
+
+    T, covariance = settled(stages(), guess, DOUBT)
+    return _Laid(T, covariance, middle.known) if _is_one_place(middle) else None
+
+
+def _is_one_place(level: Level) -> bool:
+    return level.known >= SHARED and level.usual >= USUAL
+
+
+def _looked_through(earlier: list[View], later: list[View], T: Transform) -> float:
+    """Return the share of what both saw that lies where the other looked through."""
+    found = [contradiction(view._replace(T=T @ view.T), earlier, CLOSE) for view in later]
+    number = sum(count for _, count in found)
+    return sum(share * count for share, count in found) / max(number, 1)
+
+
+def _own_axes(covariance: NDArray[np.float64], T: Transform) -> NDArray[np.float64]:
+    """Return a covariance (6, 6) along the map's axes as one along those of the pose (4, 4)."""
+    R = np.kron(np.eye(2), T[:3, :3].T)
+    return R @ covariance @ R.T
+
+
+def _seen_from(T: Transform, back: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance of T_earlier_later (4, 4) where `back` (6, 6) is that of its inverse.
+
+    Both as `Fit.covariance`: rotation about the second's origin, then shift, along the first's axes.
+    """
+    R, (x, y, z) = T[:3, :3], T[:3, 3]
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    J = np.block([[-R, np.zeros((3, 3))], [across @ R, -R]])
+    return J @ back @ J.T

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a submap may lie on an earlier one: a search over shifts and headings on a coarse grid (Olson 2009)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.correct.loops import _search
+from stereovox.correct.loops.submaps import COARSE_M, Shape
+from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
+from stereovox.track.views import GRID, View
+
+SEEDS = 300
+"""Points of the later submap that are used."""
+ON, BESIDE, THROUGH = 2, 1, -2
+"""Scores of a point in a cell with a surface, in one beside such, and in one that was looked through."""
+BEHIND_M = 0.4
+"""A cell was looked through if it is nearer than what was seen by this."""
+TURN_STEP = np.radians(3.5)
+PEAKS = 4
+"""Places that are looked at closely, usually."""
+SAME_M, SAME_RAD = 0.5, np.radians(12)
+"""Within which two places are one."""
+AT_ONCE = 1 << 20
+"""Cells that are looked at together, so that large grids need little memory."""
+LEAST = 0.12
+"""Score, of at most 1, that a place needs."""
+
+
+class Search:
+    """Finds where submaps may lie on an earlier one.
+
+    Args:
+        points: (N, 3) points on its surfaces.
+        views: What its frames saw.
+        R_level_earlier: (3, 3) turns its frame so that z points up.
+        cell: Side of a cell of the grid, in metres.
+    """
+
+    def __init__(
+        self,
+        points: NDArray[np.floating],
+        views: Iterable[View],
+        R_level_earlier: NDArray[np.float64],
+        cell: float = COARSE_M,
+    ):
+        self._cell, self._turn = cell, TURN_STEP * cell / COARSE_M
+        self._T = np.eye(4)
+        self._T[:3, :3] = R_level_earlier
+        points = points @ R_level_earlier.T
+        self._low = np.floor(points.min(axis=0) / self._cell).astype(np.int64) - 1
+        self._grid = np.zeros(np.floor(points.max(axis=0) / self._cell).astype(np.int64) + 2 - self._low, np.int8)
+        self._mark_free(views)
+        self._mark_surfaces(points)
+
+    def places(
+        self, later: Shape, guess: Transform, reach: NDArray[np.float64], turn: float, most: int = PEAKS
+    ) -> list[Transform]:
+        """Return the likeliest poses T_earlier_later (4, 4), best first; arguments as of `peaks`."""
+        return [
+            inverse(self._T) @ peak.T_level_later for peak in apart(self.peaks(later, guess, reach, turn, most), most)
+        ]
+
+    def peaks(self, later: Shape, guess: Transform, reach: NDArray[np.float64], turn: float, most: int) -> list[Peak]:
+        """Return the likeliest places of each heading.
+
+        Args:
+            later: A submap.
+            guess: (4, 4) T_earlier_later where the search begins.
+            reach: (3,) metres to each side of it that are searched: across and up.
+            turn: Radians by which its heading may be off.
+            most: Largest number of places of a heading.
+        """
+        seeds = later.points[:: max(1, len(later.points) // SEEDS)]
+        steps = int(np.ceil(turn / self._turn))
+        window = 2 * np.ceil(reach / self._cell).astype(int) + 1
+        rows, peaks = np.ascontiguousarray(self._grid.transpose(0, 2, 1)), list[Peak]()
+        found = np.empty(window[[0, 2, 1]], np.int32)
+        for angle in self._turn * np.arange(-steps, steps + 1):
+            T = self._T @ guess
+            T[:3, :3] = rotation_matrix([0, 0, angle]) @ T[:3, :3]
+            cells = np.floor((seeds @ T[:3, :3].T + T[:3, 3]) / self._cell).astype(np.int64) - self._low
+            _search.scores(rows, cells.astype(np.int32), found)
+            by_axis = np.ascontiguousarray(found.transpose(0, 2, 1))
+            for place, score in self._highest(by_axis, LEAST * ON * len(seeds), most):
+                shift = self._cell * (np.array(place) - window // 2)
+                peaks.append(Peak(score, angle, T[:3, 3] + shift, T[:3, :3]))
+        return peaks
+
+    def _highest(self, found: NDArray[np.int32], least: float, most: int) -> list[tuple[tuple[int, ...], int]]:
+        """Return where the highest scores are, and these, none in the neighbourhood of another; `found` is used up."""
+        highest, near = list[tuple[tuple[int, ...], int]](), int(np.ceil(SAME_M / self._cell))
+        while len(highest) < most:
+            place = tuple(int(i) for i in np.unravel_index(found.argmax(), found.shape))
+            if found[place] <= least:
+                break
+            highest.append((place, int(found[place])))
+            found[tuple(slice(max(i - near, 0), i + near + 1) for i in place)] = np.iinfo(np.int32).min
+        return highest
+
+    def _mark_free(self, views: Iterable[View]) -> None:
+        """Mark cells that views looked through."""
+        seen, (count, *others) = list(views), self._grid.shape
+        step = max(1, AT_ONCE // max(1, others[0] * others[1]))
+        for first in range(0, count, step):
+            self._mark_free_in(self._grid[first : first + step], first, seen)
+
+    def _mark_free_in(self, slab: NDArray[np.int8], first: int, views: Iterable[View]) -> None:
+        """Mark those of a part of the grid, from this number along its first axis."""
+        starts = np.array([first, 0, 0]) + self._low + 0.5
+        x, y, z = (self._cell * (np.arange(n) + start) for n, start in zip(slab.shape, starts, strict=True))
+        for view in views:
+            T = inverse(self._T @ view.T)
+            middles = [(x * a)[:, None, None] + (y * b)[:, None] + (z * c + d) for a, b, c, d in T[:3]]
+            ahead = np.flatnonzero(middles[2] > self._cell)
+            away = middles[2].reshape(-1)[ahead]
+            column, row = (
+                np.floor((middles[axis].reshape(-1)[ahead] / away / view.slope[axis] + 1) / 2 * GRID[1 - axis])
+                for axis in (0, 1)
+            )
+            inside = (column >= 0) & (column < GRID[1]) & (row >= 0) & (row < GRID[0])
+            nearest = view.nearest[row[inside].astype(np.intp), column[inside].astype(np.intp)]
+            free = np.isfinite(nearest) & (away[inside] < nearest - BEHIND_M)
+            slab.reshape(-1)[ahead[inside][free]] = THROUGH
+
+    def _mark_surfaces(self, points: NDArray[np.float64]) -> None:
+        """Mark cells with a surface, and those beside them."""
+        from scipy.ndimage import binary_dilation
+
+        there = np.zeros(self._grid.shape, bool)
+        there[tuple((np.floor(points / self._cell).astype(np.int64) - self._low).T)] = True
+        beside: NDArray[np.bool_] = np.array(binary_dilation(there, np.ones((3, 3, 3), bool)), bool)
+        self._grid[beside] = BESIDE
+        self._grid[there] = ON
+
+
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """A place where a submap may lie on what a search knows, in its axes turned so that z points up.
+
+    Attributes:
+        score: How well it fits there.
+        angle: Radians by which its heading is turned from the guess.
+        place: (3,) metres.
+        R: (3, 3) its rotation.
+    """
+
+    score: int
+    angle: float
+    place: NDArray[np.float64]
+    R: NDArray[np.float64]
+
+    @property
+    def T_level_later(self) -> Transform:  # noqa: N802
+        """Its pose (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.R, self.place
+        return T
+
+
+def apart(peaks: Sequence[Peak], most: int) -> list[Peak]:
+    """Return at most so many peaks from high to low, without those near a higher one."""
+    kept = list[Peak]()
+    for peak in sorted(peaks, key=lambda peak: -peak.score):
+        if not any(_is_same(peak, other) for other in kept):
+            kept.append(peak)
+        if len(kept) == most:
+            break
+    return kept
+
+
+def _is_same(one: Peak, other: Peak) -> bool:
+    turned = abs((one.angle - other.angle + np.pi) % (2 * np.pi) - np.pi)
+    return bool(turned < SAME_RAD and np.abs(one.place - other.place).max() < SAME_M)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Submaps: short runs of a map's frames, taken as rigid, and what they show."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.geometry.se3 import Transform, inverse, rotation_vector
+from stereovox.maps.record.kept_frames import KeptFrame
+from stereovox.track.surfaces import Surfaces
+from stereovox.track.surfels import Patches, SurfelMap
+from stereovox.track.views import View, view_of
+
+LONG_M, LONG_RAD = 0.8, np.radians(40)
+"""How far a submap's last frame may be from its first."""
+USED = 5
+"""Frames of a submap that are looked at, spread evenly over it."""
+MAX_PATCHES = 4000
+"""Patches of a submap that are laid onto others."""
+COARSE_M = 0.2
+"""Cells of which each gives one point for the search."""
+HALF = 1 << 20
+"""Cells to each side of a submap that have a number of their own."""
+IN_MEMORY = 48
+"""Submaps whose surfaces are held; others are made again from their frames."""
+
+
+@dataclass(eq=False)
+class Submap:
+    """A run of frames, in the order they entered the map, whose poses to each other are taken as right.
+
+    Attributes:
+        frames: The frames, with the poses they came with.
+        T_odom_frames: Their poses (4, 4), exactly rigid.
+        anchor: Number of the frame whose axes are the submap's: the middle one.
+        T_map_anchor: (4, 4) pose of that, as now believed.
+        travelled: Metres of the way until there.
+        turned: Radians of turning until there.
+        centre: (3,) mean of what it shows, in its axes.
+    """
+
+    frames: Sequence[KeptFrame]
+    T_odom_frames: Sequence[Transform]
+    T_map_anchor: Transform
+    travelled: float = 0.0
+    turned: float = 0.0
+    centre: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def anchor(self) -> int:
+        """Number of the frame whose axes are the submap's."""
+        return len(self.frames) // 2
+
+    @property
+    def T_odom_anchor(self) -> Transform:  # noqa: N802
+        """Return the pose (4, 4) that the anchor came with."""
+        return self.T_odom_frames[self.anchor]
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the anchor."""
+        return self.frames[self.anchor].stamp_ns
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """Return the mean (3,) of what it shows, in the map."""
+        return self.T_map_anchor[:3, :3] @ self.centre + self.T_map_anchor[:3, 3]
+
+    @property
+    def bend(self) -> Transform:
+        """Return what moves poses as they came, near the anchor, to where they are now believed (4, 4)."""
+        return self.T_map_anchor @ inverse(self.T_odom_anchor)
+
+
+class Shape:
+    """What a submap shows, in its anchor's frame.
+
+    Attributes:
+        surfels: Its surfaces.
+        patches: Some of them, to be laid onto those of other submaps.
+        views: What its frames saw.
+        points: (N, 3) one point for each coarse cell with a surface.
+    """
+
+    def __init__(self, seen: Sequence[tuple[Patches, Transform]]):
+        self.surfels = SurfelMap()
+        self.views: list[View] = []
+        for patches, T in seen:
+            self.surfels.add(patches, T)
+            self.views.append(view_of(patches.points, patches.sigma, T))
+        together = _joined(seen)
+        self.patches = together.thinned(max(1, -(-len(together.points) // MAX_PATCHES)))
+        cells = np.floor(together.points / COARSE_M).astype(np.int64) + HALF
+        _, first = np.unique((cells[:, 0] * 2 * HALF + cells[:, 1]) * 2 * HALF + cells[:, 2], return_index=True)
+        self.points = together.points[np.sort(first)]
+
+
+class Shapes:
+    """The shapes of submaps, made when they are needed; the latest used are held."""
+
+    def __init__(self, config: Config):
+        self._surfaces = Surfaces(config)
+        self._held: OrderedDict[Submap, Shape | None] = OrderedDict()
+
+    def __getitem__(self, submap: Submap) -> Shape | None:
+        """Return what a submap shows; None where it is too little."""
+        if submap not in self._held:
+            self._held[submap] = self._made(submap)
+            while len(self._held) > IN_MEMORY:
+                self._held.popitem(last=False)
+        self._held.move_to_end(submap)
+        return self._held[submap]
+
+    def _made(self, submap: Submap) -> Shape | None:
+        chosen = sorted({round(i) for i in np.linspace(0, len(submap.frames) - 1, USED)})
+        T_anchor_odom = inverse(submap.T_odom_anchor)
+        seen = []
+        for i in chosen:
+            try:
+                patches = self._surfaces.see(submap.frames[i].frame()).patches
+            except FrameRefused:
+                continue
+            seen.append((patches, T_anchor_odom @ submap.T_odom_frames[i]))
+        return Shape(seen) if seen else None
+
+
+def is_long(T_odom_frames: Sequence[Transform], T_odom_next: Transform) -> bool:
+    """Return whether a submap of these frames of one sensor is complete before another one of it."""
+    if not T_odom_frames:
+        return False
+    T = inverse(T_odom_frames[0]) @ T_odom_next
+    return bool(np.linalg.norm(T[:3, 3]) > LONG_M or np.linalg.norm(rotation_vector(T[:3, :3])) > LONG_RAD)
+
+
+def _joined(seen: Sequence[tuple[Patches, Transform]]) -> Patches:
+    """Return all patches in the frame that their poses lead to."""
+    points = [patches.points @ T[:3, :3].T + T[:3, 3] for patches, T in seen]
+    normals = [patches.normals @ T[:3, :3].T for patches, T in seen]
+    sigma = [patches.sigma for patches, _ in seen]
+    return Patches(*(np.concatenate(parts).astype(np.float32) for parts in (points, normals, sigma)))

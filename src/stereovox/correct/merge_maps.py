@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Merge maps: by their frames where both kept them, exactly; else by adding up their evidence."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stereovox.config import Config
+from stereovox.correct.loops.closer import LoopCloser, check_one_way, ends_of
+from stereovox.correct.loops.placing import placed
+from stereovox.errors import StereovoxError
+from stereovox.frame.validate import MAX_POSITION
+from stereovox.geometry.se3 import Transform
+from stereovox.kernels.threads import one_state
+from stereovox.localize.robot_track import Progress, no_progress
+from stereovox.mapping.deadline import Levels
+from stereovox.mapping.rebuild import Rebuild, as_corrected, need_frames
+from stereovox.maps import VoxelMap
+from stereovox.maps.record.kept_frames import KeptFrame, KeptFrames
+from stereovox.maps.record.loop_lines import LoopLines
+from stereovox.maps.storage.storage import settings_of_frames
+from stereovox.products.merge import merge as added
+from stereovox.products.merge import together
+from stereovox.products.moved import rigid
+from stereovox.products.side_by_side import check_alike
+
+OF_WORLD = {"up", "up_direction", "levelled_from"}
+"""Settings that may differ where a transform says how the worlds lie."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Result of `join`.
+
+    Attributes:
+        map: The map of the frames of both; it keeps them.
+        T_a_b: (4, 4) how the second map's world was found to lie in the first one's, before both were bent.
+        found: In how many places.
+        loops: Number of loops in both and between them that the poses now agree with.
+    """
+
+    map: VoxelMap
+    T_a_b: Transform
+    found: int
+    loops: int
+
+
+@one_state
+def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
+    """Find where a second map lies in the first by what both saw, and make one map of both.
+
+    The ways of both cameras become one pose graph, in which loops are closed and all that sees the same is laid onto
+    each other; then all frames are mapped at the poses that this gives, in the order of their stamps. The first frame
+    of `a` stays where it is.
+
+    Args:
+        a: A map that kept all its frames, whose settings the result has.
+        b: Another one, made with the same settings; its world may lie anywhere, with the same way up.
+        progress: Called with how many are done, how many there are, and the current step.
+
+    Returns:
+        The map, and how they lie.
+
+    Raises:
+        StereovoxError: Frames were not kept, settings differ, or where the second map lies cannot be found for sure.
+        MissingExtra: gtsam is not installed.
+    """
+    check_alike(a, b, np.eye(4))
+    why = why_added(a, b, np.eye(4))
+    if why is not None or a.kept_frames is None or b.kept_frames is None:
+        raise StereovoxError(f"where one map lies in the other can be found only by frames, and {why}")
+    check_one_way(a.history, a.kept_frames.frames)
+    check_one_way(b.history, b.kept_frames.frames)
+    closers = [_closed(one, words, progress) for one, words in ((a, "first"), (b, "second"))]
+    first, second = closers
+    place = placed(first, second, lambda done, total: progress(done, total, "finding the second map in the first"))
+    count = len(first.submaps)
+    first.join(second, place.T_first_second, place.loops)
+    first.finish(lambda done, total: progress(done, total, "laying places onto each other"))
+    poses = [first.corrected(slice(0, count)), first.corrected(slice(count, None))]
+    frames = [
+        [replace(frame, T_world_sensor=found[frame.sensor, frame.stamp_ns]) for frame in kept.frames]
+        for kept, found in zip((a.kept_frames, b.kept_frames), poses, strict=True)
+    ]
+    joined = _of_frames(a, b, *frames)
+    joined.recording = as_corrected(joined.recording)
+    if _follow(*frames):
+        joined.history.recordings = 1
+    joined.history.loops = LoopLines.between(*(ends_of(found, first.places) for found in (first.loops, first.refused)))
+    return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
+
+
+def _follow(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> bool:
+    """Return whether all frames of one recording are earlier than those of the other, so that both are one way."""
+    (first_a, last_a), (first_b, last_b) = (
+        (min(stamps), max(stamps)) for stamps in ([frame.stamp_ns for frame in frames] for frames in (a, b))
+    )
+    return last_a < first_b or last_b < first_a
+
+
+def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:
+    """Return all of a recording, its loops closed."""
+    assert one.kept_frames is not None
+    closer, frames = LoopCloser(one.config), one.kept_frames.frames
+    for done, frame in enumerate(frames, 1):
+        closer.add(frame)
+        progress(done, len(frames), f"looking for loops in the {words} map")
+    closer.finish()
+    return closer
+
+
+@one_state
+def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
+    """Merge two maps.
+
+    Where both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
+    order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame
+    that is in both, as where the parts of a recording overlap, counts once, from its pose in `a`. Where they cannot be
+    merged so (`why_added` says why), their evidence adds up: see `products.merge`. Cells that had reached their limits
+    may then differ from those of one run.
+
+    Args:
+        a: A map, whose settings the result has.
+        b: Another map.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a`; None where they are the same.
+
+    Returns:
+        An unbounded map.
+
+    Raises:
+        StereovoxError: The cell sizes differ, T_a_b is not a rigid motion, or there is none and the maps' `up` differs.
+        MapFileError: Kept frames of a map that was loaded are gone from the disk.
+    """
+    check_alike(a, b, T_a_b)
+    if why_added(a, b, T_a_b) is not None:
+        return added(a, b, T_a_b)
+    return _by_frames(a, b, np.eye(4) if T_a_b is None else rigid(T_a_b))
+
+
+def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str | None:
+    """Return why two maps are merged by adding up, which is not exact; None where they are merged by their frames.
+
+    Args:
+        a: A map.
+        b: Another map.
+        T_a_b: As for `merge`.
+
+    Returns:
+        A phrase for people: `a map did not keep its frames`.
+    """
+    for one in (a, b):
+        if one.kept_frames is None or not len(one.kept_frames):
+            return "a map did not keep its frames"
+        if not one.kept_frames.are_all(one.frames):
+            return "a map kept only some of its frames"
+        if one.config.window.size is not None or one.config.max_memory is not None:
+            return "a map was made within bounds (window, max_memory)"
+    differing = _differing(a.config, b.config, set() if T_a_b is None else OF_WORLD)
+    return None if differing is None else f"they were made with different settings ({differing})"
+
+
+def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
+    """Return how many kept frames two maps have in common; `merge` counts them once.
+
+    Raises StereovoxError where a map did not keep its frames.
+    """
+    ours, theirs = ({_identity(frame) for frame in need_frames(one.kept_frames, "a map").frames} for one in (a, b))
+    return len(ours & theirs)
+
+
+def _differing(a: Config, b: Config, ignored: set[str]) -> str | None:
+    """Return the name of a setting by which two maps would take in a frame differently."""
+    names = [name for name in ("map", *settings_of_frames(a)) if name not in ignored]
+    a = a.model_copy(update={"map": a.map.model_copy(update={"frames_budget": b.map.frames_budget})})
+    return next((name for name in names if getattr(a, name) != getattr(b, name)), None)
+
+
+def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
+    """Return the map of the frames of both."""
+    assert a.kept_frames is not None
+    assert b.kept_frames is not None
+    theirs = b.kept_frames.frames
+    if not np.array_equal(T_a_b, np.eye(4)):
+        theirs = [replace(frame, T_world_sensor=T_a_b @ frame.T_world_sensor) for frame in theirs]
+        if np.abs([frame.T_world_sensor for frame in theirs]).max() >= MAX_POSITION:
+            raise StereovoxError(f"the transform takes frames {MAX_POSITION:g} m away or farther; give it in metres")
+    return _of_frames(a, b, a.kept_frames.frames, theirs)
+
+
+def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequence[KeptFrame]) -> VoxelMap:
+    """Return the map of the frames of both, at the poses given here; what both have is taken once, from the first."""
+    known = set(map(_identity, ours))
+    twice = [frame for frame in theirs if _identity(frame) in known]
+    theirs = [frame for frame in theirs if _identity(frame) not in known]
+    frames = [replace(frame, number=n) for n, frame in enumerate(_in_order(ours, theirs))]
+    merged = VoxelMap(a.config)
+    merged.history = together(a.history, b.history)
+    merged.history.frames = len(frames)
+    merged.history.ways -= Counter(frame.quality for frame in twice)
+    merged.storage.kept = KeptFrames(a.config.map.frames_budget, frames)
+    rebuild = Rebuild(merged.storage, Levels(a.config), {}, whole=True)
+    rebuild.catch_up()
+    rebuild.finish()
+    return merged
+
+
+def _identity(frame: KeptFrame) -> tuple[str, int, str]:
+    """Return what two maps of one recording have in common of a frame, whatever its pose."""
+    return frame.sensor, frame.stamp_ns, frame.packed.digest
+
+
+def _in_order(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> list[KeptFrame]:
+    """Return the frames of both maps by their stamps, those of each in the order in which it took them in."""
+    result: list[KeptFrame] = []
+    left, right = deque(a), deque(b)
+    while left and right:
+        result.append((left if left[0].stamp_ns <= right[0].stamp_ns else right).popleft())
+    return [*result, *left, *right]

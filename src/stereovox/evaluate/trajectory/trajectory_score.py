@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of an estimated trajectory in space: ATE, RPE by frame, second and distance, drift.
+
+Written by hand, because evo is GPL-3 and this is Apache-2.0; the tests compare the figures with evo's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.trajectory.pose_pairs import PosePairs, TrajectoryLike, pair_poses
+from stereovox.evaluate.trajectory.trajectory_motions import (
+    ErrorFigures,
+    SegmentErrors,
+    StepErrors,
+    Transforms,
+    angles_deg,
+    mean_angle_deg,
+    motion_errors,
+    per_second,
+    segment_errors,
+    steps,
+    travelled_m,
+)
+from stereovox.geometry.se3 import Transform
+
+KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SHORT_SEGMENTS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""Segments of trajectories shorter than the first of KITTI's."""
+MIN_EXTENT_M = 1e-3
+"""A trajectory that stays this close to its middle cannot be aligned."""
+STRAIGHT = 1e-9
+"""Covariance across a trajectory, relative to that along it, below which positions leave the roll about it open."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryScore:
+    """Differences between an estimated trajectory and the true one.
+
+    pairs: the N pairs of poses, the estimated ones as they stand. T_truth_world: (4, 4) float64, what they were aligned
+    by, and scale, by which their positions were multiplied before; identity and 1 where they were not.
+    position_errors_m, rotation_errors_deg: (N,) float64 of the aligned poses; position_m (ATE) and rotation_deg are
+    their figures. rotation_offset_deg: what the rotation errors have in common, the angle of their mean: large where
+    the two do not follow the same axes of the body, or where positions nearly on a line leave the roll about it open.
+    length_m: of the truth, through its paired poses. duration_s: None without times.
+    per_frame: RPE from each pair to the next. per_second: to the pair nearest to one second later (0.9 to 1.1 s); None
+    where there is none.
+    segments: by their length, of those lengths that fit into the trajectory. translation_percent, rotation_deg_per_m:
+    means over all of them; None without segments.
+    drift_percent: by how much the end is off, in position, where the starts are laid on each other, of length_m; None
+    where the truth stands still.
+    """
+
+    pairs: PosePairs
+    T_truth_world: Transform
+    scale: float
+    aligned: bool
+    position_errors_m: NDArray[np.float64]
+    rotation_errors_deg: NDArray[np.float64]
+    position_m: ErrorFigures
+    rotation_deg: ErrorFigures
+    rotation_offset_deg: float
+    length_m: float
+    duration_s: float | None
+    per_frame: StepErrors
+    per_second: StepErrors | None
+    segments: tuple[SegmentErrors, ...]
+    translation_percent: float | None
+    rotation_deg_per_m: float | None
+    drift_percent: float | None
+
+    def aligned_positions(self) -> NDArray[np.float64]:
+        """Return (N, 3) positions in metres of the estimate, aligned, in the truth's frame."""
+        return _moved(self.pairs.T_world_body, self.T_truth_world, self.scale)[:, :3, 3]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all numbers for JSON, without NaN."""
+        pairs = self.pairs
+        return {
+            "poses": len(pairs),
+            "estimate_poses": pairs.estimate_poses,
+            "truth_poses": pairs.truth_poses,
+            "without_truth": pairs.estimate_poses - len(pairs),
+            "coverage": pairs.coverage,
+            "length_m": self.length_m,
+            "duration_s": self.duration_s,
+            "aligned": self.aligned,
+            "scale": self.scale,
+            "T_truth_world": self.T_truth_world.tolist(),
+            "position_m": asdict(self.position_m),
+            "rotation_deg": asdict(self.rotation_deg),
+            "rotation_offset_deg": self.rotation_offset_deg,
+            "per_frame": asdict(self.per_frame),
+            "per_second": None if self.per_second is None else asdict(self.per_second),
+            "segments": [asdict(one) for one in self.segments],
+            "translation_percent": self.translation_percent,
+            "rotation_deg_per_m": self.rotation_deg_per_m,
+            "drift_percent": self.drift_percent,
+        }
+
+
+def score_trajectory(
+    estimate: TrajectoryLike,
+    truth: TrajectoryLike,
+    *,
+    align: bool = True,
+    scale: bool = False,
+    max_difference_s: float | None = None,
+    segments_m: Sequence[float] | None = None,
+) -> TrajectoryScore:
+    """Compare an estimated trajectory with the true one, pose by pose and motion by motion.
+
+    Args:
+        estimate: File of poses (TUM lines, KITTI's 12 numbers, ...), or `Poses` or `ImagePoses` read from one: poses of
+            a body in a world of its own, metres.
+        truth: The same for the true poses of the same body.
+        align: Align the estimate first, rigidly, by least squares of positions. False: both are in one frame.
+        scale: Fit the scale, too (one camera without metres).
+        max_difference_s: Poses further apart in time are no pair; by default 0.02 s.
+        segments_m: Lengths in metres of KITTI's segments. By default 100 to 800 m where the truth is longer than
+            100 m, and 1, 2, 5, 10, 20, 50 m where it is not.
+
+    Returns:
+        The errors; position and rotation errors (ATE) after alignment, motions (RPE) independent of it but for scale.
+
+    Raises:
+        StereovoxError: One line: too few pairs, a pose that cannot be used, too little motion to align, a
+            `max_difference_s` for poses without times.
+    """
+    if scale and not align:
+        raise StereovoxError("scale=True: is fitted together with the alignment; leave align=True")
+    if segments_m is not None and not all(0 < length < np.inf for length in segments_m):
+        raise StereovoxError(f"segments_m={list(segments_m)}: give lengths in metres above 0")
+    pairs = pair_poses(estimate, truth, max_difference_s)
+    T_truth_world, factor = np.eye(4), 1.0
+    if align:
+        T_truth_world, factor = best_alignment(pairs, scale)
+    found, true = _moved(pairs.T_world_body, T_truth_world, factor), pairs.T_truth_body
+    gaps = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1)
+    between = np.linalg.inv(true) @ found
+    turns = angles_deg(between)
+    travelled = travelled_m(true)
+    length = float(travelled[-1])
+    usual = KITTI_SEGMENTS_M if length > KITTI_SEGMENTS_M[0] else SHORT_SEGMENTS_M
+    segments, means = segment_errors(found, true, travelled, usual if segments_m is None else segments_m)
+    first, last = np.array([0]), np.array([len(true) - 1])
+    drift = float(motion_errors(found, true, first, last)[0][0])
+    return TrajectoryScore(
+        pairs=pairs,
+        T_truth_world=T_truth_world,
+        scale=factor,
+        aligned=align,
+        position_errors_m=gaps,
+        rotation_errors_deg=turns,
+        position_m=ErrorFigures.of(gaps),
+        rotation_deg=ErrorFigures.of(turns),
+        rotation_offset_deg=mean_angle_deg(between),
+        length_m=length,
+        duration_s=None if pairs.stamps_ns is None else float(np.ptp(pairs.stamps_ns)) / 1e9,
+        per_frame=steps(found, true, np.arange(len(true) - 1), np.arange(1, len(true))),
+        per_second=per_second(found, true, pairs.stamps_ns),
+        segments=segments,
+        translation_percent=means[0],
+        rotation_deg_per_m=means[1],
+        drift_percent=100 * drift / length if length > MIN_EXTENT_M else None,
+    )
+
+
+def best_alignment(pairs: PosePairs, scale: bool = False) -> tuple[Transform, float]:
+    """Return T_truth_world (4, 4), and the factor of positions before it, that align estimated poses with true ones.
+
+    Least squares of positions (Umeyama 1991, Eq 38 to 43). Where they lie on a straight line, which leaves the roll
+    about it open, rotations decide that.
+    Raises StereovoxError where one of the two stands still.
+    """
+    ours, true = pairs.T_world_body[:, :3, 3], pairs.T_truth_body[:, :3, 3]
+    a, b = ours - ours.mean(axis=0), true - true.mean(axis=0)
+    for where, points in ((pairs.estimate, a), (pairs.truth, b)):
+        if np.linalg.norm(points, axis=1).max() < MIN_EXTENT_M:
+            cure = "score it without alignment (--no-align) or give a recording with motion"
+            raise StereovoxError(f"{where}: stands still, within {1000 * MIN_EXTENT_M:g} mm; {cure}")
+    covariance = weights = b.T @ a / len(a)
+    widths = np.linalg.svd(covariance, compute_uv=False)
+    if widths[1] <= STRAIGHT * widths[0]:
+        rolls = (pairs.T_truth_body[:, :3, :3] @ pairs.T_world_body[:, :3, :3].transpose(0, 2, 1)).mean(axis=0)
+        weights = covariance + STRAIGHT * widths[0] * rolls
+    u, _, vt = np.linalg.svd(weights)
+    R = (u * [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
+    factor = float(np.trace(R.T @ covariance) / (a**2).sum(axis=1).mean()) if scale else 1.0
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, true.mean(axis=0) - factor * R @ ours.mean(axis=0)
+    return T, factor
+
+
+def _moved(T_world_body: Transforms, T_truth_world: Transform, scale: float) -> NDArray[np.float64]:
+    scaled = T_world_body.copy()
+    scaled[:, :3, 3] *= scale
+    return T_truth_world @ scaled

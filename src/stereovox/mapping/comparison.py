@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the evidence of a frame with the map before the map takes it in; what contradicts it is looked at closely."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.config import Config
+from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
+from stereovox.geometry.se3 import Transform, apart, rotation_matrix
+from stereovox.integrate.views import PerCamera, sensor_table
+from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
+from stereovox.mapping.gate import Gate, Passed
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.record.glance import Glance, Votes
+from stereovox.maps.record.history import Doubt
+from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.noise import RangeNoise
+
+SURFACES = (State.OCCUPIED, State.TENTATIVE)
+FIRM = 0.4
+"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
+GLANCED, POINTS, TRIED = 2000, 500, 100
+"""Most points of a frame in doubt that a glance keeps, that are looked at in the map, and that faults are tried on."""
+BLUR = 1.5
+"""Tolerance from glance to glance, as a multiple of that towards the map: both are noisy."""
+GAIN = 0.1
+"""Share of its points by which a frame must agree better under a fault, however little there is to explain."""
+DEEP_CELLS = 4
+"""Cells from a surface that is seen through to what is seen behind it; a floor seen at a flat angle is thick."""
+REACH = 60.0
+"""Metres along a ray within which the map's first surface is sought."""
+FARTHEST = 10
+"""Maximum ranges beyond which points do not count: a lidar may give any number, and the map ends somewhere."""
+
+MIRRORED = {
+    "mirrored": (-1, 1, 1),
+    "upside down": (1, -1, 1),
+    "turned by half": (-1, -1, 1),
+    "back to front": (1, 1, -1),
+}
+TURNS_DEG = (-32, -24, -16, -8, 8, 16, 24, 32)
+STRETCHES = (0.67, 0.77, 0.87, 1.15, 1.3, 1.5)
+
+ALIGNED, BESIDE = 300, 3
+"""Most pixels that are registered with the map, and the distance in pixels of the neighbours for their normals."""
+AROUND, FLAT = 16, 0.1
+"""Points of a cloud that give one its normal, and how flat they must lie: their spreads across and along."""
+DENSE = 4000
+"""Most points of a cloud among which these are sought."""
+STEPS, EVERY = 20, 3
+"""Iterations of the registration, and of how many frames in doubt one is registered."""
+REACH_M, REACH_CELLS = 0.6, 2.0
+"""Search radius of a point for its surface in the first iteration (metres) and in the last (cells)."""
+MIN_POINTS = 30
+"""Points that must find a surface."""
+MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
+"""How far a knocked camera may stand from its pose."""
+DAMPING = 1e-3
+"""Damping of the least squares, for motions that no surface constrains."""
+
+
+def _faults() -> dict[str, NDArray[np.float64]]:
+    """Return what each fault makes of points in the sensor's frame: a matrix (3, 3)."""
+    turns = [(f"turned by {deg} deg", np.radians(deg) * axis) for axis in np.eye(3) for deg in TURNS_DEG]
+    return {
+        **{name: np.diag(signs).astype(float) for name, signs in MIRRORED.items()},
+        **{f"{name} about {'xyz'[n // len(TURNS_DEG)]}": rotation_matrix(by) for n, (name, by) in enumerate(turns)},
+        **{f"seen with a focal length x {1 / k:.2g}": np.diag([k, k, 1.0]) for k in STRETCHES},
+        **{f"stretched along z by {1 / k:.2g}": np.diag([1.0, 1.0, k]) for k in STRETCHES},
+    }
+
+
+FAULTS = _faults()
+
+
+class Comparison:
+    """Compares the evidence of each frame with the map, and lets the gate decide whether to accept the frame."""
+
+    def __init__(self, config: Config, gate: Gate):
+        self._gate, self._compares = gate, config.trust.max_disagreement < 1
+        self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+        self._noise = PerCamera(partial(RangeNoise.of, config.noise))
+        self._prepared = False
+
+    def check(
+        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: Passed, voxel_map: VoxelMap
+    ) -> Passed:
+        """Return what the gate needs to accept the frame.
+
+        evidence: what was made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
+        `Gate.check_agreement`.
+        """
+        if not self._compares:
+            return passed
+        self._prepare(voxel_map, image)
+        against = voxel_map.storage.agreement(evidence, self._firm[image.camera]).against
+        with voxel_map.lock:
+            doubted = self._gate.in_doubt(passed, against)
+            sight = self._sight(image, self._gate.doubt(passed), voxel_map) if doubted else None
+            return self._gate.check_agreement(frame, passed, against, sight)
+
+    def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
+        """Look at the first image once, so that kernels compile then and not when a frame is in doubt."""
+        if not self._prepared:
+            self._prepared = True
+            self._sight(image, None, voxel_map)
+            pose_on_surfaces(voxel_map, image)
+
+    def _sight(self, image: AnyImage, doubt: Doubt | None, voxel_map: VoxelMap) -> Sight:
+        """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
+        T, seen = image.T_world_sensor, _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range)
+        points = _thinned(seen, POINTS)
+        tolerance = np.maximum(voxel_map.voxel_size, self._noise[image.camera].sigma(np.linalg.norm(points, axis=1)))
+        placed = _placed(voxel_map, T, points, tolerance)
+        against = placed.against
+        known = int((placed.agrees | against).sum())
+        anchored = float(placed.agrees.sum()) / known if known >= max(FEW, MOSTLY_KNOWN * len(points)) else None
+        votes, frames = Votes(), 0
+        if doubt is not None and doubt.glance is not None:
+            votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
+        fault = _fault(voxel_map, image, points, tolerance, placed, align=frames % EVERY == 0)
+        return Sight(anchored, fault, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
+
+
+class Placed(NamedTuple):
+    """Where points (N,) lie in the map.
+
+    agrees: on a surface. against: in what is known to be free, or behind an occupied cell and on no surface. behind:
+    on a surface, seen through an occupied cell before it. lengths: how often the ray to a point fits between the
+    sensor and the map's first surface along it, inf where there is none.
+    """
+
+    agrees: NDArray[np.bool_]
+    against: NDArray[np.bool_]
+    behind: NDArray[np.bool_]
+    lengths: NDArray[np.float64]
+
+
+def _placed(voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
+    """Return where points (N, 3) in the sensor's frame lie in the map."""
+    if not len(points):
+        none = np.zeros(0, bool)
+        return Placed(none, none, none, np.zeros(0))
+    rays = points @ T[:3, :3].T
+    away = np.linalg.norm(points, axis=1)
+    agrees = _on_surface(voxel_map, T, points, tolerance)
+    first = voxel_map.cast_rays(np.broadcast_to(T[:3, 3], rays.shape), rays, REACH).distance.astype(float)
+    gap = away - np.where(np.isfinite(first), first, np.inf)
+    through = gap > tolerance + DEEP_CELLS * voxel_map.voxel_size
+    midway = np.where(through, (1 - 0.5 * gap / away), 1.0)
+    between = voxel_map.state(T[:3, 3] + rays * midway[:, None]) == State.FREE
+    free = voxel_map.state(T[:3, 3] + rays) == State.FREE
+    return Placed(agrees, ~agrees & (through | free), agrees & through & between, first / away)
+
+
+def _on_surface(
+    voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which points (..., 3) in the sensor's frame lie on a surface, give or take (...) metres along the ray."""
+    step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
+    tries = np.stack([points * (1 - step), points, points * (1 + step)])
+    placed = tries.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    return np.any(voxel_map.state(placed).reshape(tries.shape[:-1]) >= State.TENTATIVE, axis=0)
+
+
+def _fault(
+    voxel_map: VoxelMap,
+    image: AnyImage,
+    points: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    placed: Placed,
+    align: bool,
+) -> str:
+    """Return the fault under which points (N, 3) would lie on the map's surfaces, "" where there is none.
+
+    Tried are those of `FAULTS`, depths too large or too small by a factor or by some metres, and a sensor that stands
+    elsewhere; the last only if `align`, for it takes longest.
+    """
+    points, tolerance, lengths = (_thinned(values, TRIED) for values in (points, tolerance, placed.lengths))
+    found = np.isfinite(lengths) & (lengths > 0)
+    if not found.any():
+        return ""
+    times = float(np.median(lengths[found]))
+    away = np.linalg.norm(points, axis=1)
+    metres = float(np.median((lengths - 1)[found] * away[found]))
+    tried = [
+        *(points @ matrix.T for matrix in FAULTS.values()),
+        times * points,
+        points * (1 + metres / away)[:, None],
+    ]
+    names = [*FAULTS, f"its depths x {1 / times:.2g}", f"its depths {-metres:+.2g} m"]
+    T = image.T_world_sensor
+    shares = _on_surface(voxel_map, T, np.stack(tried), np.broadcast_to(tolerance, (len(tried), len(points)))).mean(1)
+    as_it_is = float(_on_surface(voxel_map, T, points, tolerance).mean())
+    enough = as_it_is + max(EXPLAINED * (1 - as_it_is), GAIN)
+    best = int(shares.argmax())
+    if shares[best] >= enough:
+        return "moved" if " about " in names[best] else names[best]
+    pose = pose_on_surfaces(voxel_map, image) if align else None
+    if pose is not None and _on_surface(voxel_map, pose, points, tolerance).mean() >= enough:
+        return "moved"
+    return ""
+
+
+def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
+    """Return a T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
+
+    None where there is no such pose, or the image already lies there within a cell.
+
+    Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the search
+    radius shrinks from iteration to iteration.
+    """
+    points, normals = _surfaces(image, FARTHEST * voxel_map.config.max_range)
+    T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
+    for reach in np.geomspace(REACH_M, last, STEPS):
+        there, planes = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
+        found = voxel_map.nearest_obstacle(there, float(reach), SURFACES) if len(there) else None
+        near = np.isfinite(found.distance) if found else np.zeros(0, bool)
+        if found is None or near.sum() < MIN_POINTS:
+            return None
+        T = _motion(there[near], planes[near], voxel_map.centers(found.cell[near])) @ T
+    shift_m, turn = apart(tuple(image.T_world_sensor[:3].ravel().tolist()), tuple(T[:3].ravel().tolist()))
+    moved_m = np.linalg.norm(points @ (T - image.T_world_sensor)[:3, :3].T + (T - image.T_world_sensor)[:3, 3], axis=1)
+    elsewhere = moved_m.mean() > voxel_map.voxel_size and shift_m <= MAX_SHIFT_M and turn <= MAX_TURN
+    return T if elsewhere else None
+
+
+def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
+    """Return some of the image's points (N, 3) up to `reach` metres from the sensor, in its frame, about `most`."""
+    if isinstance(image, CheckedCloud):
+        points = image.ends[image.hits]
+        return _thinned(points[_near(points, reach)], most)
+    step = max(1, round((image.depth_m.size / most) ** 0.5))
+    rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
+    points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
+    return points[_near(points, reach)]
+
+
+def _near(points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """Return which points (..., 3) are finite, lie up to `reach` metres from the sensor, and not in it."""
+    with np.errstate(over="ignore"):
+        away = np.linalg.norm(points, axis=-1)
+    return (away > 0) & (away <= reach)
+
+
+def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """Return every n-th of values (N, ...), at most `most` of them."""
+    return values[:: max(1, -(-len(values) // most))]
+
+
+def _surfaces(image: AnyImage, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some points (N, 3) up to `reach` metres from the sensor, and their normals (N, 3), in its frame."""
+    if isinstance(image, CheckedCloud):
+        points = image.ends[image.hits]
+        return _surfaces_of_cloud(points[_near(points, reach)])
+    height, width = image.depth_m.shape
+    step = max(1, round((image.depth_m.size / ALIGNED) ** 0.5))
+    rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    here = _points(image, v, u)
+    across = _points(image, v, u + BESIDE) - _points(image, v, u - BESIDE)
+    down = _points(image, v + BESIDE, u) - _points(image, v - BESIDE, u)
+    normals = np.cross(across, down)
+    length = np.linalg.norm(normals, axis=-1)
+    seen = _near(here, reach) & np.isfinite(length) & (length > 0)
+    return here[seen], normals[seen] / length[seen][:, None]
+
+
+def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some of these points and their normals, by the plane through the points around each."""
+    from scipy.spatial import KDTree
+
+    if len(points) < AROUND:
+        return np.empty((0, 3)), np.empty((0, 3))
+    points = _thinned(points, DENSE)
+    some = _thinned(points, ALIGNED)
+    _, near = KDTree(points).query(some, AROUND)
+    arms = points[near] - points[near].mean(axis=1, keepdims=True)
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", arms, arms))
+    flat = spread[:, 0] < FLAT * spread[:, 1]  # a single ring of a lidar is a line, and has no normal
+    return some[flat], axes[flat, :, 0]
+
+
+def _points(image: DepthImage, v: NDArray[np.integer], u: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the points (..., 3) of pixels, NaN where they have no depth."""
+    columns, rows = (rays.astype(float) for rays in image.camera.rays())
+    depth = np.where(np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], np.nan)
+    return np.stack([columns[u], rows[v, 0], rows[v, 1]], axis=-1) * depth[..., None]
+
+
+def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDArray[np.float64]) -> Transform:
+    """Return the small rigid motion (4, 4) that brings points (N, 3), along their normals, nearest to others."""
+    middle = points.mean(axis=0)
+    arms = points - middle
+    jacobian = np.hstack([np.cross(arms, normals), normals])
+    gap = ((onto - points) * normals).sum(axis=1)
+    square = jacobian.T @ jacobian + DAMPING * len(points) * np.eye(6)
+    turn, shift = np.split(np.linalg.solve(square, jacobian.T @ gap), 2)
+    T = np.eye(4)
+    T[:3, :3] = rotation_matrix(turn)
+    T[:3, 3] = middle + shift - T[:3, :3] @ middle
+    return T
+
+
+def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera | Lidar) -> int:
+    """Return the evidence in thousandths above which a hit is firm."""
+    return round(FIRM * int(sensor_table(sensor, config, camera).hit.max()))

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames that contradict the map: is something wrong with them, or has the world changed?"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, name_of
+from stereovox.maps.record.glance import Glance, Votes
+from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, Doubt, History, RunningMean
+
+DISAGREES, CONTRADICTS, CAMERA_MOVED = "disagrees_with_map", "contradicts_map", "camera_moved"
+"""Refusal reasons: while a doubt is young, once it has lasted for `trust.changed_s`, and where another pose fits."""
+USUAL_AT_FIRST, USUAL_GAIN = RunningMean(0.25, 0.06), 0.2
+"""Disagreement assumed of a new sensor, and the weight of each frame in the exponential mean."""
+SPREADS = 4
+"""Spreads above the mean that are still usual."""
+MAX_LIMIT = 0.8
+"""Disagreement that is too much, whatever is usual."""
+AGAIN = 0.6
+"""Share of the tolerance above the usual that a frame may use to end a doubt: it must clearly agree."""
+SOON_S, LATE_S = 0.2, 1.0
+"""A frame that comes later than SOON_S after the one before may disagree more: up to twice as much LATE_S later. It
+sees much that is new, and the world had time to change."""
+FITS = 1 / 6
+"""Share of doubted frames that must agree from another pose for the verdict MOVED; only some are registered."""
+UNTIMED_HZ = 30
+"""Frame rate assumed where stamps stand still."""
+ANCHORED = 0.5
+"""Share of what a frame sees of the known that must agree with the map: a change of the world is local."""
+EXPLAINED = 0.4
+"""Share of what does not agree that a fault must explain to be the cause."""
+MOSTLY_KNOWN, AGREES = 0.5, 0.95
+"""Shares of a frame's points that must be known, and of these that must agree, for a doubt that has lasted to end."""
+FEW = 20
+"""Points that are too few to judge by."""
+TELLING = 0.2
+"""Share of the contradicting points that must tell a world from a fault, or else the camera has hardly moved."""
+WORLDLY = 0.6
+"""Share of these that must have stayed at their place in the world."""
+LOOKS = 3
+"""Looks in a row, each from another pose, at which a changed world must have stayed where it is."""
+PARTLY = "less than half of what it sees of the known is where it was: another place, or a fault"
+CURES = {
+    "moved": "it would agree from elsewhere; calibrate where the sensor is, or reset the tracker",
+    "unanchored": f"{PARTLY}; check the sensor, or start a new map",
+    "still": "move the sensor: at rest a fault cannot be told from a world that has changed",
+    "fixed": "what contradicts the map moves with the sensor; clean it, or restart it",
+    "restless": "what contradicts the map is nowhere twice; check the sensor, or wait",
+    "": "it is looked at from more places",
+}
+"""What keeps a doubt open, and what helps."""
+
+
+class Sight(NamedTuple):
+    """How a frame in doubt lies in the map, point by point.
+
+    anchored: share of its points on what is known that agree with the map; None where less than MOSTLY_KNOWN of all
+    are. fault: the fault under which it would agree, "" where there is none. against: how many points contradict the
+    map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
+    the glance before says of both. glance: what it sees itself.
+    """
+
+    anchored: float | None
+    fault: str
+    against: int
+    behind: int
+    votes: Votes
+    glance: Glance
+
+    @property
+    def agrees(self) -> bool:
+        """Whether it ends a doubt that has lasted: it sees much of the known, and nearly all of that is there."""
+        return (self.anchored or 0.0) >= AGREES and not self.fault
+
+    @property
+    def told(self) -> int:
+        """How many points tell a changed world from a fault."""
+        return self.votes.world + self.votes.sensor + self.votes.neither
+
+    @property
+    def telling(self) -> bool:
+        """Whether these are enough; they are few where the sensor has hardly moved."""
+        return self.told >= max(FEW, TELLING * self.against)
+
+    @property
+    def outcome(self) -> str:
+        """The name of the fault, or a key of CURES: what is wrong with it; "" where it shows a changed world."""
+        if self.fault:
+            return self.fault
+        if self.anchored is None or self.anchored < ANCHORED:
+            return "unanchored"
+        if self.behind >= max(FEW, WORLDLY * (self.behind + self.against)):
+            return ""
+        if not self.telling:
+            return "still"
+        if self.votes.world >= WORLDLY * self.told:
+            return ""
+        return "fixed" if self.votes.sensor > self.votes.neither else "restless"
+
+    def kept(self, before: Glance | None) -> Glance:
+        """Return the glance to compare the next frame with: a new one once there was enough to see from elsewhere."""
+        in_view = sum(self.votes) >= max(FEW, TELLING * self.against)
+        return before if before is not None and in_view and not self.telling else self.glance
+
+
+class Agreement(NamedTuple):
+    """How an accepted frame agrees with the map.
+
+    against: its disagreement, None where too little is known. doubt: the doubt that remains. after: the reason of the
+    refusals that this acceptance ends, "" where there were none.
+    """
+
+    against: float | None
+    doubt: Doubt | None = None
+    after: str = ""
+
+
+class DisagreementMonitor:
+    """Compares each frame's disagreement with the map with that of its sensor's recent frames, kept in `history`.
+
+    A frame that disagrees more is refused, and so are the frames after it until one agrees again. The world has changed
+    once, after `trust.changed_s` at least, LOOKS frames in a row saw from different poses what contradicts the map at
+    one place of the world, while no fault explained it and half of the known was still there (`Sight.outcome`). From
+    then on frames are accepted, as long as that holds, until they agree again. Frames that see nothing known while
+    others are in doubt are refused, for the next ones would agree with those. Other frames that see nothing known
+    cannot be judged, and are accepted.
+    """
+
+    def __init__(self, config: Config, history: History):
+        self._history, self._trust = history, config.trust
+        self._excess = max(config.trust.max_disagreement, config.trust.pose_error_m / config.voxel_size)
+        self._changed_ns = round(1e9 * config.trust.changed_s)
+
+    def limit(self, sensor: str, stamp_ns: int, share: float = 1.0) -> float:
+        """Return how far a frame may disagree with the map, 0 to 1; `share`: of the tolerance above the usual."""
+        mean, spread = self._history.usual.get(sensor, USUAL_AT_FIRST)
+        late_s = 1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S
+        share *= 1 + min(max(late_s / LATE_S, 0.0), 1.0)
+        return min(mean + share * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
+
+    def in_doubt(self, sensor: str, stamp_ns: int, against: float | None) -> bool:
+        """Return whether `check` needs a `Sight` of the frame."""
+        doubt = self._history.doubts.get(sensor)
+        if against is None:
+            return doubt is not None and doubt.verdict != CHANGED
+        return not self._agrees(doubt, sensor, stamp_ns, against)
+
+    def check(
+        self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
+    ) -> Agreement:
+        """Return what `accept` needs once the map has changed.
+
+        against: share of the frame's evidence that contradicts the map, None where too little is known. sight: how it
+        lies in the map, where it is `in_doubt`. Raises FrameRefused: `disagrees_with_map`, `camera_moved`,
+        `contradicts_map`.
+        """
+        before = self._history.doubts.get(sensor)
+        if sight is None:
+            return Agreement(against, before if against is None else None)
+        limit = self.limit(sensor, stamp_ns)
+        doubt = Doubt(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
+        if sight.agrees and self._lasted(doubt, self._changed_ns):
+            return Agreement(1 - (sight.anchored or 0.0) if against is None else against)
+        doubt = self._judged(doubt, sight)
+        if doubt.verdict == CHANGED:
+            waited = before is not None and before.verdict == CHANGED
+            return Agreement(against, doubt, "" if waited or before is None else self._reason(before))
+        if before is not None or not sight.agrees:  # or else it alone is in doubt, and not those after it
+            self._remember(sensor, doubt)
+        raise self._refusal(frame, against, limit, doubt, sight)
+
+    def accept(self, sensor: str, agreement: Agreement) -> None:
+        """Remember a frame that the map took in."""
+        if agreement.doubt is not None:
+            self._remember(sensor, agreement.doubt)
+        elif agreement.against is not None:
+            self._history.doubts.pop(sensor, None)
+            usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+            self._history.usual[sensor] = usual.updated(agreement.against, USUAL_GAIN)
+
+    def _last_ns(self, sensor: str, now_ns: int) -> int:
+        """Return the stamp of the frame before, accepted or in doubt; `now_ns` where there is none."""
+        stamps_ns = [self._history.doubts[sensor].last_ns] if sensor in self._history.doubts else []
+        stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
+        return max(stamps_ns, default=now_ns)
+
+    def _agrees(self, doubt: Doubt | None, sensor: str, stamp_ns: int, against: float) -> bool:
+        return against <= self.limit(sensor, stamp_ns, AGAIN if doubt else 1.0)
+
+    def _judged(self, doubt: Doubt, sight: Sight) -> Doubt:
+        """Return a doubt after one more frame."""
+        outcome = sight.outcome
+        looks = doubt.looks + 1 if not outcome else doubt.looks if outcome == "still" else 0
+        fits = doubt.fits + (outcome == "moved")
+        doubt = doubt._replace(looks=looks, fits=fits, glance=sight.kept(doubt.glance), verdict="")
+        if self._lasted(doubt, self._changed_ns) and looks >= LOOKS:
+            return doubt._replace(verdict=CHANGED)
+        if self._lasted(doubt, self._changed_ns) and fits >= FITS * (doubt.frames + 1):
+            moved_s = self._trust.moved_s
+            waited = moved_s is not None and self._lasted(doubt, round(1e9 * moved_s))
+            return doubt._replace(verdict=CHANGED if waited else MOVED)
+        return doubt
+
+    def _lasted(self, doubt: Doubt, enough_ns: int) -> bool:
+        return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns
+
+    def _remember(self, sensor: str, doubt: Doubt) -> None:
+        if sensor in self._history.doubts or len(self._history.doubts) < MAX_SENSORS:
+            self._history.doubts[sensor] = doubt
+
+    def _reason(self, doubt: Doubt) -> str:
+        if doubt.verdict == MOVED:
+            return CAMERA_MOVED
+        return CONTRADICTS if self._lasted(doubt, self._changed_ns) else DISAGREES
+
+    def _refusal(
+        self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt, sight: Sight
+    ) -> FrameRefused:
+        detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
+        if against is None:
+            detail = "nothing that it sees is known, and frames just before it disagree with the map"
+        outcome = "moved" if doubt.verdict == MOVED else sight.outcome
+        cure = CURES.get(outcome, f"it would agree if it were {outcome}; check driver, units and calibration")
+        return FrameRefused(self._reason(doubt), f"{name_of(frame)}: {detail}; {cure}")

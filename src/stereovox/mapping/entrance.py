@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All that is checked before a measurement may change a map: one row a check, one cell a kind of input.
+
+A cell is the function that refuses, or the reason why there is nothing to check. Whatever brings measurements (arrays,
+recordings, cameras that run, ROS, fleets) hands them to `Mapper.add` or `GridMapper.add`, so the checks are the same.
+tests/mapping/test_entrance.py offers a bad input for each cell, and takes each function away to see that it is the one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from stereovox.depth import DepthPipeline, cloud, quality, scan
+from stereovox.depth.prepare import _check_image, prepare
+from stereovox.depth.stereo import pipeline as stereo
+from stereovox.frame import validate
+from stereovox.integrate import Integration, beams, views
+from stereovox.integrate.points import Points
+from stereovox.mapping.deadline import Deadline
+from stereovox.mapping.disagreement import DisagreementMonitor
+from stereovox.mapping.gate import Gate
+from stereovox.maps.cells.capped import CappedStorage
+from stereovox.maps.grid_map import GridStorage
+
+IMAGE, PAIR, CLOUD = "depth image", "stereo pair", "cloud"
+SCAN, IMAGE_SCAN, PAIR_SCAN = "2-D scan", "depth image to scan", "stereo pair to scan"
+KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN
+"""Kinds of input: the first three enter a `Mapper`, the others a `GridMapper`."""
+Refuses = Callable[..., Any]
+Cell = Refuses | tuple[Refuses, ...] | str
+"""The function that refuses a bad input, or several, the later ones in case of the first; or why nothing is checked."""
+
+
+class Check(NamedTuple):
+    """One check of all kinds of input.
+
+    Attributes:
+        reason: The word that refusals are counted by.
+        when: When an input is refused.
+        cells: By kind of input.
+        setting: The settings that change it, "" where there are none.
+    """
+
+    reason: str
+    when: str
+    cells: dict[str, Cell]
+    setting: str = ""
+
+
+def _cells(one: Cell, *others: Cell) -> dict[str, Cell]:
+    """Return the cells of all kinds: one for all, three (images and pairs, clouds, scans), or six."""
+    if not others:
+        return dict.fromkeys(KINDS, one)
+    if len(others) == 2:
+        return dict(zip(KINDS, (one, one, *others, one, one), strict=True))
+    return dict(zip(KINDS, (one, *others), strict=True))
+
+
+METRES = "its numbers are metres by definition; see `bad_units`"
+FROM_PAIR = "its depth is made here, in metres"
+SPACE = "evidence in space may come from any attitude"
+OWN_POSE = "its pose is the sensor's own"
+LIT = "it is no picture: where light is wrong, values are missing"
+BOUNDED = "the grid's work is bounded by `max_range`, which may span 4096 cells"
+NOT_COMPARED = "what moves in a plane leaves it as a whole; localisation has laid the scan onto the map"
+NO_PIXELS = "it has no pixels"
+BY_CAMERA = "the camera bounds its size"
+ANY_MAPPER = "both mappers take it"
+FAULT_OF_PAIR = validate.validate_fields, stereo.grey_rectified
+
+CHECKS = (
+    Check("bad_form", "a field is of another type", _cells(validate._check_fields)),
+    Check("bad_form", "it is no frame at all, an array is masked, or `pose_sigma` is not two deviations",
+          _cells(validate.validate_fields)),
+    Check("bad_form", "the mapper does not take this kind",
+          _cells(ANY_MAPPER, ANY_MAPPER, 
+                 (DepthPipeline.matched, validate.validate_fields, validate._check_fields), validate.validate_fields,
+                 ANY_MAPPER, ANY_MAPPER)),
+    Check("bad_stamp", "a stamp is no int64", _cells(validate._check_fields)),
+    Check("bad_sensor", "the name of the sensor is no text", _cells(validate._check_fields)),
+    Check("bad_sensor", "the name of the sensor is not printable, or longer than 256 characters",
+          _cells(Gate._identify)),
+    Check("bad_sensor", "it is the 65th sensor", _cells(Gate._fitting)),
+    Check("(its own)", "the source could not deliver it, and says why (`fault`)",
+          _cells(validate.validate_fields, FAULT_OF_PAIR, *[validate.validate_fields] * 3, FAULT_OF_PAIR)),
+    Check("bad_dtype", "values are of another type",
+          _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
+                 stereo.grey)),
+    Check("bad_shape", "an array has another shape than its camera, or its points",
+          _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
+                 stereo.grey)),
+    Check("bad_scale", "whole numbers come without a `depth_scale`, or it is not positive: 1500 may be 1.5 m or 1.5 km",
+          _cells(_check_image, FROM_PAIR, METRES, METRES, _check_image, FROM_PAIR)),
+    Check("bad_reason", "reasons of pixels are invalid",
+          _cells(_check_image, FROM_PAIR, NO_PIXELS, NO_PIXELS, _check_image, FROM_PAIR)),
+    Check("bad_camera", "the view is out of proportion to the image",
+          _cells(views.check_view, views.check_view, NO_PIXELS, NO_PIXELS, BOUNDED, BOUNDED)),
+    Check("view_too_large", "there is evidence on more cells than can be kept or fit the image",
+          _cells(views.check_blocks, views.check_blocks, Points._is_wide, BOUNDED, BOUNDED, BOUNDED)),
+    Check("too_many_points", "a cloud has over 8,388,608 points", 
+          _cells(BY_CAMERA, cloud._points, "see `too_many_beams`")),
+    Check("too_many_beams", "a scan has over 65,536 beams",
+          _cells(BY_CAMERA, "see `too_many_points`", beams._beams_of)),
+    Check("bad_scan", "angles or limits are invalid", _cells(BY_CAMERA, NO_PIXELS, validate.validate_scan)),
+    Check("bad_clear", "`clear` or `clear_from` has another length",
+          _cells("it has none", "see `bad_shape`", beams._beams_of)),
+    Check("no_pose", "there is no pose", _cells(validate.rigid_pose)),
+    Check("pose_not_finite", "the pose holds NaN or infinity", _cells(validate._check_place)),
+    Check("pose_too_far", "the position is 1000 km or more from the origin", _cells(validate._check_place)),
+    Check("pose_too_far", "it is more than about 2^30 cells from the map's origin",
+          _cells(*[views.check_place] * 3, *[beams.Beams._aim] * 3)),
+    Check("pose_not_rigid", "the pose is a mirror, a scale or a shear", _cells(validate.rigid_pose),
+          "pose_rigidity_tolerance"),
+    Check("mount_not_rigid", "the lidar's mount on the robot is no rigid motion",
+          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount)),
+    Check("mount_too_far", "the lidar's mount is 1000 km or more from the robot",
+          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount)),
+    Check("pose_extrapolated",
+          "its pose is more than 0.05 s away from the nearest measured one (`pose_off_ns`)", _cells(Gate._identify),
+          "trust.max_pose_off_s"),
+    Check("stamp_backwards", "it is earlier than the last trusted one", _cells(Gate._settled), "trust.ordered"),
+    Check("clock_reset", "it is earlier by more than 1 s, or more than an hour later", _cells(Gate._settled),
+          "trust.clock_reset_s, trust.max_gap_s"),
+    Check("pose_jump", "it would have moved at more than 40 m/s or 1500 degrees/s", _cells(Gate._settled),
+          "trust.max_speed_mps, trust.max_turn_dps"),
+    Check("frozen_image", "it is identical to the one before, but the sensor has moved by over 1 cm or 0.5 degrees",
+          _cells(Gate._look), "trust.frozen"),
+    Check("bad_units", "half of its depths or ranges are far beyond, or far below, what the map's limits allow",
+          _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays)),
+    Check("no_valid_depth", "not one pixel has a value, and none is too far",
+          _cells(prepare, "see `no_valid_point`", "see `no_valid_range`")),
+    Check("no_valid_point", "not one ray can be used", _cells("see `no_valid_depth`", cloud.checked_cloud,
+                                                             "see `no_valid_range`")),
+    Check("no_valid_range", "not one beam has a range",
+          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan)),
+    Check("too_few_values", "less than 0.5 % of the pixels, points or beams say something",
+          _cells(quality._check_share, quality._check_number, quality._check_number), "trust.min_valid_share"),
+    Check("no_surfaces", "less than half of the values are like those next to them, as they are on surfaces",
+          _cells(quality.check_depth, quality._check_alike, quality._check_alike), "trust.min_surface_share"),
+    Check("too_dark", "90 % of an image are black",
+          _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
+    Check("overexposed", "90 % of an image are saturated",
+          _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
+    Check("tilted", "the lidar leans by more than 5 degrees, so its beams meet the floor",
+          _cells(SPACE, SPACE, SPACE, validate.validate_upright_scan, "see `camera_tilted`", "see `camera_tilted`"),
+          "grid.max_tilt_deg"),
+    Check("camera_tilted", "no row of the image looks level (method `rows`; `cloud` takes any)",
+          _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.level_rows, scan.level_rows), "scan.off_level_deg"),
+    Check("camera_vertical", "the camera looks straight up or down",
+          _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.levelled, scan.levelled)),
+    Check("below_floor", "the camera, or much of what it sees, lies below the floor",
+          _cells(SPACE, SPACE, SPACE, "a lidar measures at one height", scan.check_floor, scan.check_floor),
+          "scan.floor"),
+    Check("heights_not_seen", "the camera sees nothing of `scan.heights`",
+          _cells(SPACE, SPACE, SPACE, "a lidar measures at one height", scan.check_heights, scan.check_heights),
+          "scan.heights"),
+    Check("disagrees_with_map", "more of it contradicts the map than is usual for its sensor",
+          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.max_disagreement, trust.pose_error_m"),
+    Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and what they show is no changed world",
+          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.changed_s"),
+    Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from elsewhere",
+          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.moved_s"),
+    Check("memory_full", "its cells do not fit into `max_memory`",
+          _cells(CappedStorage.check_room, CappedStorage.check_room, CappedStorage.check_room, GridStorage.check_room,
+                 GridStorage.check_room, GridStorage.check_room), "max_memory, when_full"),
+    Check("no_time", "frames take longer than `deadline_ms` even at the quickest level",
+          _cells(*[Deadline.quality] * 3, *["a floor's grid has no deadline: a scan takes about a millisecond"] * 3),
+          "deadline_ms"),
+    Check("no_clouds", "clouds are mapped on the processor only",
+          _cells("it is mapped there, too", Integration.evidence, "grids are made on the processor only"), "device"),
+)  # fmt: skip
+"""All checks; those of the same reason by where they are made."""
+
+ELSEWHERE = {
+    "missing_file": "no such image or cloud",
+    "unreadable": "the file or message is damaged, truncated, or of another kind",
+    "bad_pose_file": "a pose that cannot be read",
+    "low_confidence": "camera pair: the tracker trusts its pose less than `min_confidence`",
+    "not_localised": "the ROS 2 node does not know where the robot is in its map",
+    "clock_doubt": "live, ROS 2: it is not known how far the clocks of sensors and poses are apart",
+    "no_camera": "ROS 2: no camera info has come",
+    "tracking_lost": "tracking: it is not known where the camera is",
+    "no_photo": "tracking: no picture was taken along with a depth image",
+    "not_in_order": "SLAM and localisation: not later than the scan before",
+}
+"""Reasons that sources, trackers and localisation give; a frame with one as its `fault` is refused for it."""
+
+
+def table(checks: Sequence[Check] = CHECKS) -> list[str]:
+    """Return the table as lines of Markdown: for each check and kind its function, or why there is none."""
+    head = f"| refused as | when | {' | '.join(KINDS)} | setting |"
+    lines = [head, "|" + "---|" * (len(KINDS) + 3)]
+    for check in checks:
+        cells = " | ".join(_shown(check.cells[kind]) for kind in KINDS)
+        lines.append(f"| `{check.reason}` | {check.when} | {cells} | {_settings(check.setting)} |")
+    return lines
+
+
+def _settings(names: str) -> str:
+    return ", ".join(f"`{name}`" for name in names.split(", ")) if names else "-"
+
+
+def functions(cell: Cell) -> tuple[Refuses, ...]:
+    """Return the functions of a cell."""
+    if isinstance(cell, str):
+        return ()
+    return cell if isinstance(cell, tuple) else (cell,)
+
+
+def _shown(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return f"-: {cell}"
+    return ", ".join(f"`{function.__qualname__.removeprefix('_')}`" for function in functions(cell))

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last check before a frame may change the map: does it agree with the frames before it, and with the map?
+
+`Gate` compares stamps, poses and images; `trust.disagreement` judges how far the evidence contradicts the map.
+"""
+
+from __future__ import annotations
+
+import zlib
+from math import cos, inf, radians
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
+from stereovox.geometry.se3 import apart
+from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
+from stereovox.maps.record.history import MAX_NAME_LENGTH, MAX_SENSORS, Doubt, History, Look, Seen, Streak
+
+SLACK_M, SLACK_RAD = 0.05, radians(2)
+"""Pose noise: a step this small is no jump, however short the time."""
+BACKWARDS, RESET, JUMP = "stamp_backwards", "clock_reset", "pose_jump"
+STILL_M, STILL_RAD = 0.01, radians(0.5)
+"""Apparent motion of a camera at rest with a jittery tracker."""
+DIGEST_ROWS = 16
+"""Rows of an image that its checksum covers."""
+DIGEST_POINTS = 1024
+"""Points of a cloud that its checksum covers: many may have no value."""
+ROUGH, ROUGH_SHARE = 1e-3, 0.2
+"""Measured inverse depth bends by at least this share of itself, at this share of the pixels; walls without noise do
+not, and look the same from many places."""
+
+
+class Passed(NamedTuple):
+    """A frame that passed the gate: its sensor, stamp and pose.
+
+    after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None for scans. agreement:
+    how it agrees with the map, None where that was not compared.
+    """
+
+    sensor: str
+    seen: Seen
+    after: str = ""
+    look: Look | None = None
+    agreement: Agreement | None = None
+
+    @property
+    def note(self) -> str:
+        """Line for the report, "" where there is nothing to report."""
+        return f"frames of '{self.sensor}' are accepted again after {self.after}" if self.after else ""
+
+
+class Gate:
+    """Checks stamps and poses of each sensor against its last trusted frame, kept in `history` and saved with the map.
+
+    A frame that jumped, or whose clock was reset, is refused, and so are the frames after it that belong to it. Once
+    they have agreed with each other for `trust.settle_s` (by their stamps) they are accepted again, so that a tracker
+    that relocalised is not refused for ever. A frame counts with the refused ones where coming from them takes a lower
+    speed than from the trusted one. A frame that fits the trusted one ends the wait of the others.
+    """
+
+    def __init__(self, config: Config, history: History):
+        trust = config.trust
+        self._history, self._trust, self._monitor = history, trust, DisagreementMonitor(config, history)
+        self._turn = radians(trust.max_turn_dps)
+        off, reset, ahead, settle = trust.max_pose_off_s, trust.clock_reset_s, trust.max_gap_s, trust.settle_s
+        self._off_ns, self._reset_ns, self._ahead_ns, self._settle_ns = (
+            round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
+        )
+
+    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> Passed:
+        """Return what `accept` needs once the map has changed.
+
+        image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
+        `stamp_backwards`, `clock_reset`, `pose_jump`, `frozen_image`. Of a refused frame only its stamp and pose are
+        remembered, since it may agree with the next one.
+        """
+        sensor, stamp_ns = self._identify(frame)
+        numbers = image.T_world_sensor.ravel().tolist()
+        now = Seen(stamp_ns, tuple(numbers[:12]))
+        passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
+        if passed.after:
+            self._history.doubts.pop(sensor, None)  # they were about another place or another time
+        return passed
+
+    def in_doubt(self, passed: Passed, against: float | None) -> bool:
+        """Return as `DisagreementMonitor.in_doubt`."""
+        return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
+
+    def doubt(self, passed: Passed) -> Doubt | None:
+        """Return the doubt that frames of its sensor are in, None where they agree."""
+        return self._history.doubts.get(passed.sensor)
+
+    def check_agreement(self, frame: AnyFrame, passed: Passed, against: float | None, sight: Sight | None) -> Passed:
+        """Return what `accept` needs of a frame that was compared with the map.
+
+        Arguments and errors: as `DisagreementMonitor.check`.
+        """
+        agreement = self._monitor.check(frame, passed.sensor, passed.seen.stamp_ns, against, sight)
+        return passed._replace(agreement=agreement, after=passed.after or agreement.after)
+
+    def accept(self, passed: Passed) -> None:
+        """Remember a frame that the map took in."""
+        self._history.trusted[passed.sensor] = passed.seen
+        self._history.waiting.pop(passed.sensor, None)
+        if passed.look is not None:
+            self._history.looks[passed.sensor] = passed.look
+        if passed.agreement is not None:
+            self._monitor.accept(passed.sensor, passed.agreement)
+        if passed.after:
+            self._history.settled[passed.after] += 1
+
+    def _identify(self, frame: AnyFrame | Scan) -> tuple[str, int]:
+        """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses that are too old."""
+        off_ns = abs(int(frame.pose_off_ns))
+        if off_ns > self._off_ns:
+            limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
+            detail = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
+            raise FrameRefused("pose_extrapolated", detail)
+        if len(frame.sensor) > MAX_NAME_LENGTH or not frame.sensor.isprintable():
+            detail = f"sensor is not a printable name of at most {MAX_NAME_LENGTH} characters; rename it"
+            raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
+        usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
+        return frame.sensor or usual, int(frame.stamp_ns)
+
+    def _look(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Look | None:
+        """Return the frame's checksum. Raises FrameRefused for a repeated image although the sensor has moved."""
+        if not self._trust.frozen:
+            return None
+        look, before = Look(_digest(frame), now.pose), self._history.looks.get(sensor)
+        if before is None or before.digest != look.digest:
+            return look
+        metres, angle = apart(before.pose, now.pose)
+        if (metres > STILL_M or angle > STILL_RAD) and _is_measured(frame):
+            what, cure = ("image", "camera") if isinstance(frame, Frame | StereoFrame) else ("sweep", "lidar")
+            detail = f"the {what} is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
+            raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
+        return before
+
+    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Passed:
+        """Return a frame that fits the last trusted one, or that is accepted again."""
+        trusted = self._history.trusted.get(sensor)
+        if trusted is None:
+            if len(self._history.trusted) >= MAX_SENSORS:
+                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MAX_SENSORS} sensors; name fewer")
+            return Passed(sensor, now)
+        why, haste = self._against(trusted, now)
+        waiting = self._history.waiting.get(sensor)
+        if waiting is None and not why:
+            return Passed(sensor, now)
+        return self._settled(frame, Passed(sensor, now), trusted, (why, haste), waiting)
+
+    def _against(self, before: Seen, now: Seen) -> tuple[str, float]:
+        """Return why `now` cannot follow `before` ("": it can), and its speed as a share of what is allowed."""
+        ahead_ns = now.stamp_ns - before.stamp_ns
+        if self._trust.ordered and (ahead_ns < 0 or ahead_ns > self._ahead_ns):
+            return (BACKWARDS if -self._reset_ns <= ahead_ns < 0 else RESET), inf
+        if ahead_ns <= 0:
+            return "", 0.0  # the same time, as far as is known: no speed
+        metres, angle = apart(before.pose, now.pose)
+        allowed = 1e-9 * ahead_ns
+        moved, turned = (metres - SLACK_M) / self._trust.max_speed_mps, (angle - SLACK_RAD) / self._turn
+        haste = max(moved, turned) / allowed
+        return (JUMP if haste > 1 else ""), haste
+
+    def _settled(
+        self, frame: AnyFrame | Scan, passed: Passed, trusted: Seen, found: tuple[str, float], waiting: Streak | None
+    ) -> Passed:
+        """Return the frame where it may be accepted although it does not fit or others wait; otherwise refuse it."""
+        (why, haste), now = found, passed.seen
+        follows, slower = False, False
+        if waiting is not None:
+            unfit, their_haste = self._against(waiting.last, now)
+            follows, slower = not unfit, their_haste < haste
+        if not why and not (follows and slower):
+            return passed
+        if waiting is not None and follows:
+            why, since_ns = waiting.why, waiting.since_ns
+        else:
+            since_ns = now.stamp_ns
+        detail = f"{name_of(frame)}: {self._detail(why, trusted, now)}"
+        if why == BACKWARDS:
+            raise FrameRefused(why, detail)
+        if now.stamp_ns - since_ns >= self._settle_ns:
+            return passed._replace(after=why)
+        self._history.waiting[passed.sensor] = Streak(why, since_ns, now)
+        raise FrameRefused(why, detail)
+
+    def _detail(self, why: str, before: Seen, now: Seen) -> str:
+        seconds = (now.stamp_ns - before.stamp_ns) / 1e9
+        if why == BACKWARDS:
+            return f"taken {-seconds:.6g} s before the last trusted one; put frames in order or set trust.ordered=false"
+        until = f"accepted again once frames agree for {self._trust.settle_s:g} s"
+        if why == RESET:
+            return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
+        metres, angle = apart(before.pose, now.pose)
+        return (
+            f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
+        )
+
+
+def _rows(image: np.ndarray) -> np.ndarray:
+    return image[DIGEST_ROWS // 2 if len(image) > DIGEST_ROWS else 0 :: max(1, len(image) // DIGEST_ROWS)]
+
+
+def _digest(frame: AnyFrame | Scan) -> int:
+    """Return a checksum of DIGEST_ROWS rows of the frame's images, of DIGEST_POINTS points, or of all ranges."""
+    if isinstance(frame, StereoFrame):
+        parts = _rows(frame.left), _rows(frame.right)
+    elif isinstance(frame, Cloud):
+        parts = (frame.points[:: max(1, len(frame.points) // DIGEST_POINTS)],)
+    else:
+        parts = (frame.ranges if isinstance(frame, Scan) else _rows(frame.depth),)
+    number = 0
+    for part in parts:
+        number = zlib.crc32(np.ascontiguousarray(part).tobytes(), number)
+    return number
+
+
+def _is_measured(frame: AnyFrame | Scan) -> bool:
+    """Return whether depths or ranges have noise: whether their inverse bends between neighbours.
+
+    That of a plane does not in an image, and between beams only by their angle. Other frames are taken for measured.
+    """
+    if isinstance(frame, StereoFrame | Cloud):
+        return True
+    is_scan = isinstance(frame, Scan)
+    rows = (frame.ranges[None] if is_scan else _rows(frame.depth)).astype(float)
+    straight = 2 * cos(frame.angle_step) if is_scan else 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(np.isfinite(rows) & (rows > 0), 1 / rows, np.nan)
+        bend = np.abs(inverse[:, 2:] + inverse[:, :-2] - straight * inverse[:, 1:-1]) / inverse[:, 1:-1]
+    bend = bend[np.isfinite(bend)]
+    return bool(bend.size and (bend > ROUGH).mean() > ROUGH_SHARE)

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every mapper does around its map: take frames one at a time, gate them, count refusals, monitor health."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from types import TracebackType
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, AnyImage, Scan, UpdateReport
+from stereovox.frame.stamp_clock import StampsBy
+from stereovox.frame.wall_clock import epoch_ns
+from stereovox.kernels.threads import MapLock
+from stereovox.mapping.gate import Gate, Passed
+from stereovox.maps import VoxelMap
+from stereovox.maps.grid_map import GridMap
+from stereovox.maps.record.health import FULL, Health, HealthMonitor
+
+
+class Intake:
+    """Entrance for frames of one map: one frame at a time.
+
+    A refused frame (FrameRefused) is counted in the map's history and changes nothing else.
+
+    Attributes:
+        gate: Compares each frame with those before it; its memory is the map's history.
+        monitor: Records when each frame was taken and arrived, and what became of it.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        target: VoxelMap | GridMap,
+        clock: Callable[[], int],
+        stamps_by: StampsBy,
+    ):
+        self.gate = Gate(config, target.history)
+        self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
+        self._map, self._adding = target, MapLock()
+
+    def offer(self, frame: AnyFrame | Scan) -> Offer:
+        """Return a frame that arrives now; enter it with `with` while the map takes it in.
+
+        Raises:
+            StereovoxError: This thread holds the map's lock.
+        """
+        arrived_ns = self.monitor.now()
+        self._map.lock.refuse_holder()
+        return Offer(self, frame, arrived_ns)
+
+    def closed(self) -> AbstractContextManager[object]:
+        """Return what lets no frame in while it is entered."""
+        return self._adding
+
+
+class Aged:
+    """What mappers say of their map's age, by their `_intake`."""
+
+    _intake: Intake
+
+    def health(self, now_ns: int | None = None) -> Health:
+        """Return how current the map is.
+
+        Args:
+            now_ns: Nanoseconds by `clock`; None for now.
+
+        Returns:
+            State, age and recent refusals of the map.
+        """
+        return self._intake.monitor.health(now_ns)
+
+    @property
+    def stamp_clock(self) -> StampsBy:
+        """By which clock frames are stamped, from which `health` knows how late they come; it may be set at any time.
+
+        A function: returns the present time by that clock in nanoseconds, None while it is not known. "live": stamps
+        advance with the time, by a clock of this machine, which is recognised, or by another, of which the least delay
+        that was seen is taken for none. "replay": stamps are those of a recording, played at any speed; ages count from
+        the newest stamp. None: a clock of this machine where it is recognised, else as "replay", until an
+        `ObstacleSender` makes it "live". Setting it raises ConfigError for anything else.
+        """
+        return self._intake.monitor.stamps.by
+
+    @stamp_clock.setter
+    def stamp_clock(self, clock: StampsBy) -> None:
+        self._intake.monitor.stamps.by = clock
+
+    def heard(self, stamp_ns: int, source: str = "poses") -> None:
+        """Take note that something with a stamp came now, such as a pose: what was stamped earlier is at least as old.
+
+        Args:
+            stamp_ns: Its time in nanoseconds, by the clock of the frames' stamps.
+            source: Where it came from.
+        """
+        monitor = self._intake.monitor
+        monitor.stamps.heard(f"{source} alone", int(stamp_ns), monitor.now())
+
+    def now_ns(self) -> int:
+        """Return nanoseconds by the mapper's `clock`, which never goes back."""
+        return self._intake.monitor.now()
+
+    def age_ns(self, stamp_ns: int, came_ns: int) -> int:
+        """Return how old is what was stamped so and came at `came_ns`, by `now_ns`: at least as long as it is there."""
+        now_ns = self.now_ns()
+        return max(self._intake.monitor.stamps.age_ns(stamp_ns, now_ns), now_ns - came_ns)
+
+
+class Offer:
+    """A frame on its way into the map. While it is entered, others wait; a FrameRefused inside the block ends there.
+
+    Attributes:
+        report: What became of the frame: set by the mapper, or on exit where the frame was refused.
+    """
+
+    __slots__ = ("_arrived_ns", "_frame", "_intake", "report")
+    report: UpdateReport
+
+    def __init__(self, intake: Intake, frame: AnyFrame | Scan, arrived_ns: int):
+        self._intake, self._frame, self._arrived_ns = intake, frame, arrived_ns
+
+    def __enter__(self) -> Offer:
+        self._intake._adding.acquire()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> bool:
+        try:
+            if not isinstance(error, FrameRefused):
+                return False
+            self._refuse(error)
+            return True
+        finally:
+            self._intake._adding.release()
+
+    def check(self, image: AnyImage | Scan) -> Passed:
+        """Check the frame, of which `image` was made, and return what `accept` needs. Raises as `Gate.check`."""
+        intake = self._intake
+        with intake._map.lock:
+            return intake.gate.check(self._frame, image)
+
+    def accept(self, passed: Passed, quality: str = FULL) -> None:
+        """Record that the map took the frame in; call it under the same hold of the map's lock."""
+        intake, history = self._intake, self._intake._map.history
+        history.offered(self._frame)
+        history.frames += 1
+        intake.gate.accept(passed)
+        intake.monitor.accept(self._arrived_ns, passed.sensor, passed.seen.stamp_ns, quality)
+
+    def _refuse(self, refused: FrameRefused) -> None:
+        intake = self._intake
+        with intake._map.lock:
+            intake._map.history.offered(self._frame)
+            intake._map.history.refuse(refused.reason)
+        intake.monitor.refuse(self._arrived_ns, refused.reason)
+        self.report = UpdateReport(refused=refused.reason, detail=str(refused))

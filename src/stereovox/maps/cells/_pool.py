@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels over the blocks of a map: blocks come, go, lose their row of numbers and get one again; see `CellPool`.
+
+Every kernel takes the pool as four arrays: `table`, `coords`, `values`, `count`. A place below `len(values)` is that of
+a row, a place from there on that of a bare block. The caller has made room.
+"""
+
+import numpy as np
+
+from stereovox.kernels._jit import cell, kernel
+from stereovox.maps.cells._cells import EMPTY, copy_row, empty_slot, enter, find, find_or_insert, slot_of
+
+
+@kernel
+def rebuild_all(table, coords, n):
+    """Enter the first `n` blocks of the pool into an empty hash table."""
+    table[:] = EMPTY
+    for i in range(n):
+        enter(table, coords, i)
+
+
+@kernel
+def insert_all(table, coords, count, wanted, indices):
+    """Find or make every block of `wanted` (n, 3); write pool indices to `indices` (n,)."""
+    for i in range(wanted.shape[0]):
+        indices[i] = find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
+
+
+NOTHING, BARE, ROW = np.uint8(0), np.uint8(1), np.uint8(2)
+"""What a block of cells needs: no place at all, as none is known; a bare one, as all are at the floor; a row."""
+
+
+@kernel
+def rebuild(table, coords, values, count):
+    """Enter all blocks of the pool into the hash table anew."""
+    table[:] = EMPTY
+    for row in range(count[0]):
+        enter(table, coords, row)
+    for n in range(count[1]):
+        enter(table, coords, values.shape[0] + n)
+
+
+@kernel
+def needs(cells, unknown, lowest, out):
+    """Write to `out` (n,) what each block of `cells` (n, 512) needs: NOTHING, BARE or ROW."""
+    for i in range(cells.shape[0]):
+        out[i] = need(cells[i], unknown, lowest)
+
+
+@kernel
+def put(table, coords, values, count, wanted, cells, kinds):
+    """Set blocks `wanted` (n, 3) to `cells` (n, 512), each with what it needs by `kinds` (n,)."""
+    for i in range(wanted.shape[0]):
+        x, y, z = wanted[i, 0], wanted[i, 1], wanted[i, 2]
+        forget(table, coords, values, count, x, y, z)
+        if kinds[i] == ROW:
+            copy_row(values[new_row(table, coords, count, x, y, z)], cells[i])
+        elif kinds[i] == BARE:
+            place = values.shape[0] + count[1]
+            coords[place, 0], coords[place, 1], coords[place, 2] = x, y, z
+            enter(table, coords, place)
+            count[1] += 1
+
+
+@kernel
+def remove(table, coords, values, count, gone):
+    """Forget blocks `gone` (n, 3), each there or not."""
+    for i in range(gone.shape[0]):
+        forget(table, coords, values, count, gone[i, 0], gone[i, 1], gone[i, 2])
+
+
+@kernel
+def find_all(table, coords, wanted, places):
+    """Write the places of blocks `wanted` (n, 3) to `places` (n,), -1 where there is none."""
+    for i in range(wanted.shape[0]):
+        places[i] = find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2])
+
+
+@cell
+def need(block, unknown, lowest):
+    """Return what a block of 512 stored numbers needs: NOTHING, BARE or ROW."""
+    known, above = np.int16(0), np.int16(0)
+    for c in range(512):
+        number = np.int16(block[c])
+        known = np.int16(known | np.int16(number ^ np.int16(unknown)))
+        above = np.int16(above | np.int16(number ^ np.int16(lowest)))
+    if above == 0:
+        return BARE
+    return NOTHING if known == 0 else ROW
+
+
+@cell
+def new_row(table, coords, count, x, y, z):
+    """Make the row of a block that is not there, its numbers yet to be written; return it."""
+    row = count[0]
+    coords[row, 0], coords[row, 1], coords[row, 2] = x, y, z
+    enter(table, coords, row)
+    count[0] = row + 1
+    return row
+
+
+@cell
+def with_row(table, coords, values, count, place, lowest):
+    """Return the row of the block at `place`, which gets one if it is bare."""
+    if place < values.shape[0]:
+        return place
+    row = count[0]
+    values[row] = lowest
+    _move(table, coords, place, row)
+    count[0] = row + 1
+    _close_bare_gap(table, coords, values, count, place)
+    return row
+
+
+@cell
+def make_bare(table, coords, values, count, row):
+    """Take its row from a block whose cells are all at the floor; another block may get that row."""
+    _move(table, coords, row, values.shape[0] + count[1])
+    count[1] += 1
+    _close_row_gap(table, coords, values, count, row)
+
+
+@cell
+def forget(table, coords, values, count, x, y, z):
+    """Take block (x, y, z), there or not, out of the pool."""
+    slot = slot_of(table, coords, x, y, z)
+    if slot >= 0:
+        place = np.int64(table[slot])
+        empty_slot(table, coords, slot)
+        if place < values.shape[0]:
+            _close_row_gap(table, coords, values, count, place)
+        else:
+            _close_bare_gap(table, coords, values, count, place)
+
+
+@cell
+def _move(table, coords, old, new):
+    """Give the block at place `old` the place `new`."""
+    table[slot_of(table, coords, coords[old, 0], coords[old, 1], coords[old, 2])] = new
+    coords[new, 0], coords[new, 1], coords[new, 2] = coords[old, 0], coords[old, 1], coords[old, 2]
+
+
+@cell
+def _close_row_gap(table, coords, values, count, row):
+    last = count[0] - 1
+    if row != last:
+        _move(table, coords, last, row)
+        copy_row(values[row], values[last])
+    count[0] = last
+
+
+@cell
+def _close_bare_gap(table, coords, values, count, place):
+    last = values.shape[0] + count[1] - 1
+    if place != last:
+        _move(table, coords, last, place)
+    count[1] -= 1

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All blocks of a voxel map: those with a row of numbers, and bare ones, whose cells are all as free as can be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.kernels.threads import in_shards, shards
+from stereovox.maps.cells import _add, _pool
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.storage.blocks import CELLS, StoredCells, table_size
+
+GROWTH = 1.5
+"""A pool that is full becomes so many times as large; one that is SPARE times too large shrinks to as much."""
+SPARE = 4
+PIECE = 1024
+"""Blocks that `pieces` yields at once."""
+WORTH_A_THREAD = 2048
+"""Blocks of evidence that take as long as it takes to wake a thread."""
+
+
+class CellPool:
+    """Blocks of 8x8x8 cells by their coordinates; cell (i, j, k) of a block is number `64 i + 8 j + k` of 512.
+
+    A block none of whose cells is known is not kept. One whose cells all hold the lowest number, as most of the empty
+    space of a room does, is bare: it has coordinates, but no row of numbers.
+
+    values: (rows, 512) stored numbers, of which the first `count[0]` are in use.
+    coords: (rows + bare, 3) int32 block coordinates: those of the rows, and from `len(values)` on the bare ones.
+    count: (2,) int64, how many of both are in use.
+    table: the hash from block coordinates to places in `coords`.
+    rows, bare: for how many there is room at the start; the pool never shrinks below that.
+    """
+
+    def __init__(self, rules: CellRules, rows: int = 256, bare: int = 256):
+        self.rules = rules
+        self._limits = tuple(map(np.int16, (rules.format.unknown, rules.prior, rules.lowest, rules.highest)))
+        self._least = rows, bare
+        self._has_settled = False
+        self.count = np.zeros(2, np.int64)
+        self.values = np.empty((0, CELLS), rules.format.dtype)
+        self.coords = np.empty((0, 3), np.int32)
+        self._resize(rows, bare)
+
+    def __len__(self) -> int:
+        return int(self.count.sum())
+
+    @property
+    def unknown(self) -> int:
+        """What a cell without evidence holds."""
+        return self.rules.format.unknown
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes in use: rows, coordinates and the hash."""
+        return (
+            int(self.count[0]) * self.values.itemsize * CELLS + len(self) * self.coords[:1].nbytes + self.table.nbytes
+        )
+
+    @property
+    def reserved_bytes(self) -> int:
+        """Bytes of all arrays, in use or not; of what was never used, the system need not have given any."""
+        return self.values.nbytes + self.coords.nbytes + self.table.nbytes
+
+    @property
+    def stored_cells(self) -> StoredCells:
+        """What kernels that only read need; holds until the pool changes."""
+        unknown = np.int32(self.rules.format.unknown)
+        return StoredCells(self.table, self.coords, self.values, unknown, self.rules.lowest)
+
+    @property
+    def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.integer], NDArray[np.int64]]:
+        """The pool as kernels that change it take it; what they add must have room."""
+        return self.table, self.coords, self.values, self.count
+
+    @property
+    def block_coords(self) -> NDArray[np.int32]:
+        """Coordinates (n, 3) of all blocks, in no order."""
+        return self.coords[self._places()]
+
+    def put(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
+        kinds, places = np.empty(len(coords), np.uint8), np.empty(len(coords), np.int64)
+        coords, cells = np.ascontiguousarray(coords, np.int32), np.ascontiguousarray(cells)
+        _pool.needs(cells, self._limits[0], self._limits[2], kinds)
+        _pool.find_all(self.table, self.coords, coords, places)  # a block that is there keeps its room
+        new_row, new_bare = (places < 0) | (places >= len(self.values)), places < len(self.values)
+        self._reserve(int(((kinds == _pool.ROW) & new_row).sum()), int(((kinds == _pool.BARE) & new_bare).sum()))
+        _pool.put(*self.arrays, coords, cells, kinds)
+        self._shrink()
+
+    def get(self, coords: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return those of the blocks (n, 3) that are there, and their cells (n, 512) as stored."""
+        places = np.empty(len(coords), np.int64)
+        _pool.find_all(self.table, self.coords, coords, places)
+        return coords[places >= 0], self._cells_at(places[places >= 0], self.values)
+
+    def within(
+        self, low: NDArray[np.integer], high: NDArray[np.integer]
+    ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return the blocks from `low` (3,) to below `high` (3,), and their cells (n, 512) as stored, in no order."""
+        places = self._places()
+        coords = self.coords[places]
+        inside = ((coords >= low) & (coords < high)).all(axis=1)
+        return coords[inside], self._cells_at(places[inside], self.values)
+
+    def remove(self, coords: NDArray[np.int32]) -> None:
+        """Forget blocks (n, 3), each there or not."""
+        _pool.remove(*self.arrays, coords)
+        self._shrink()
+
+    def pieces(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+        """Yield coordinates (n, 3) and cells (n, 512) of all blocks in ascending order, at least once.
+
+        Of blocks that are made meanwhile nothing is yielded, others are as they are at their time.
+        """
+        coords = self.block_coords
+        coords = coords[np.lexsort(coords.T[::-1])]
+        for start in range(0, max(len(coords), 1), PIECE):
+            yield self.get(coords[start : start + PIECE])
+
+    def add(
+        self,
+        coords: NDArray[np.int32],
+        values: NDArray[np.int16],
+        uniform: NDArray[np.int32],
+        steps: NDArray[np.int16],
+        threads: int,
+    ) -> int:
+        """Add `values` (n, 512) to blocks `coords` (n, 3), and `steps` (m,) to the cells of `uniform` (m, 3).
+
+        In differences of stored numbers; no block is named twice. Returns the number of cells that changed.
+        """
+        rows = self._rows_for(coords, values, uniform)
+        floored, changed = np.zeros(len(rows), np.uint8), []
+
+        def one_shard(part: slice) -> None:
+            evidence = self.values, rows, part.start, part.stop, values, steps, np.empty(CELLS, np.int16)
+            changed.append(_add.add(*evidence, *self._limits, floored))
+
+        in_shards(one_shard, shards(len(rows), min(threads, len(rows) // WORTH_A_THREAD or 1)))
+        sunk = int(np.count_nonzero(floored))
+        if sunk or not self._has_settled:  # the first time in any case: its kernel is compiled with the others
+            self._settle(sunk, coords, uniform, floored)
+            self._has_settled = True
+        return sum(changed)
+
+    def needed_for(
+        self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
+    ) -> tuple[int, int]:
+        """Return the most rows and bare blocks that are in use while this evidence is added; it changes nothing."""
+        rows = np.empty(len(coords) + len(uniform), np.int32)
+        made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
+        has, bare = self.count.tolist()
+        return has + made, bare + int(np.count_nonzero(rows != _add.SKIP))
+
+    def needed_by(self, cells: NDArray[np.integer]) -> tuple[int, int]:
+        """Return how many rows and bare blocks are in use when blocks of `cells` (n, 512) have come on top."""
+        kinds = np.empty(len(cells), np.uint8)
+        _pool.needs(np.ascontiguousarray(cells), self._limits[0], self._limits[2], kinds)
+        has, bare = self.count.tolist()
+        return has + int((kinds == _pool.ROW).sum()), bare + int((kinds == _pool.BARE).sum())
+
+    def _rows_for(
+        self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
+        """Return the rows (n + m,) that evidence goes to, made where there was none; below 0 where it says nothing."""
+        n, (unknown, _, lowest, _) = len(coords), self._limits
+        rows = np.empty(n + len(uniform), np.int32)
+        made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
+        if made:
+            self._reserve(made, 0)
+            for blocks, theirs in ((coords, rows[:n]), (uniform, rows[n:])):
+                _add.make_rows(*self.arrays, blocks, unknown, lowest, theirs)
+        return rows
+
+    def _settle(
+        self, sunk: int, coords: NDArray[np.int32], uniform: NDArray[np.int32], floored: NDArray[np.uint8]
+    ) -> None:
+        """Take the rows from as many blocks as have `sunk` to the floor, marked in `floored` (n + m,)."""
+        n, (unknown, _, lowest, _) = len(coords), self._limits
+        self._reserve(0, sunk)
+        for blocks, theirs in ((coords, floored[:n]), (uniform, floored[n:])):
+            _add.settle(*self.arrays, blocks, theirs, unknown, lowest)
+        self._shrink()
+
+    def _places(self) -> NDArray[np.int64]:
+        rows, bare = self.count.tolist()
+        return np.concatenate([np.arange(rows), len(self.values) + np.arange(bare)])
+
+    def _cells_at(self, places: NDArray[np.int64], values: NDArray[np.integer]) -> NDArray[np.integer]:
+        cells = np.full((len(places), CELLS), self.rules.lowest, values.dtype)
+        has_row = places < len(values)
+        cells[has_row] = values[places[has_row]]
+        return cells
+
+    def _room(self) -> tuple[int, int]:
+        return len(self.values), len(self.coords) - len(self.values)
+
+    def _reserve(self, rows: int, bare: int) -> None:
+        """Make room for so many more; rows keep their place."""
+        used, room = self.count.tolist(), self._room()
+        needed = used[0] + rows, used[1] + bare
+        if needed[0] > room[0] or needed[1] > room[1]:
+            self._resize(*(max(n, int(GROWTH * has)) if n > has else has for n, has in zip(needed, room, strict=True)))
+
+    def _shrink(self) -> None:
+        """Give back room that is far from being used."""
+        used = self.count.tolist()
+        if any(has > max(SPARE * n, least) for has, n, least in zip(self._room(), used, self._least, strict=True)):
+            self._resize(*(max(int(GROWTH * n), least) for n, least in zip(used, self._least, strict=True)))
+
+    def _resize(self, rows: int, bare: int) -> None:
+        (used, bare_used), before = self.count.tolist(), len(self.values)
+        values = self.values if rows == before else np.empty((rows, CELLS), self.values.dtype)
+        coords = np.empty((rows + bare, 3), np.int32)
+        if rows != before:
+            values[:used] = self.values[:used]
+        coords[:used], coords[rows : rows + bare_used] = self.coords[:used], self.coords[before : before + bare_used]
+        self.values, self.coords = values, coords
+        self.table = np.empty(table_size(rows + bare), np.int32)
+        _pool.rebuild(*self.arrays)

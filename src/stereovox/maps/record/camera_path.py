@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The path of the cameras that made a map, thinned to what is worth drawing."""
+
+from __future__ import annotations
+
+import base64
+from array import array
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.geometry.se3 import Transform, apart
+
+SPACING_M = 0.05
+"""A pose is kept when the camera has moved this far, or turned by twice as many radians, since the last one."""
+MAX_STOPS = 2048
+"""Poses kept of all sensors together; when there are more, the spacing doubles."""
+FARTHEST = 1e7
+"""Bound of all numbers of a pose; frames with positions beyond a tenth of it are refused."""
+POSE = 12
+"""Numbers of a pose."""
+
+
+class Seen(NamedTuple):
+    """Pose of a sensor at a time: the 12 numbers of the upper three rows of T_world_sensor, row by row."""
+
+    stamp_ns: int
+    pose: tuple[float, ...]
+
+
+@dataclass
+class CameraPath:
+    """Poses along the path of each sensor, in the order in which their frames entered the map.
+
+    spacing: least metres between two poses, and half the least radians. stops: poses by sensor, rounded to float32 as
+    they are saved.
+    """
+
+    spacing: float = SPACING_M
+    stops: dict[str, list[Seen]] = field(default_factory=dict)
+
+    def walk(self, sensor: str, seen: Seen) -> None:
+        """Add a pose if it is far enough from the last one of its sensor."""
+        stops = self.stops.setdefault(sensor, [])
+        if stops and not self._is_far(stops[-1], seen):
+            return
+        stops.append(Seen(seen.stamp_ns, tuple(array("f", seen.pose))))
+        while sum(map(len, self.stops.values())) > MAX_STOPS:
+            self.spacing *= 2
+            self.stops = {name: self._thinned(kept) for name, kept in self.stops.items()}
+
+    def poses(self, sensor: str) -> NDArray[np.float64]:
+        """Return T_world_sensor (N, 4, 4) of the kept poses of a sensor."""
+        matrices = np.tile(np.eye(4), (len(self.stops[sensor]), 1, 1))
+        matrices[:, :3] = np.reshape([seen.pose for seen in self.stops[sensor]], (-1, 3, 4))
+        return matrices
+
+    def lines(self) -> list[NDArray[np.float64]]:
+        """Return the positions (N, 3) in metres, world frame, of each sensor that has any, in the order of frames."""
+        return [self.poses(sensor)[:, :3, 3] for sensor, stops in self.stops.items() if stops]
+
+    def until(self, stamp_ns: float = inf) -> list[tuple[str, Transform]]:
+        """Return sensor and T_world_sensor (4, 4) of each pose up to a time in nanoseconds, sensor by sensor."""
+        return [
+            (sensor, pose)
+            for sensor, stops in self.stops.items()
+            for seen, pose in zip(stops, self.poses(sensor), strict=True)
+            if seen.stamp_ns <= stamp_ns
+        ]
+
+    def saved(self) -> dict[str, Any]:
+        """Return plain values for JSON, which `loaded` reads; numbers are packed, little-endian, in base64."""
+        return {
+            "spacing": self.spacing,
+            "stops": {
+                sensor: {
+                    "stamps_ns": _packed([seen.stamp_ns for seen in stops], "<i8"),
+                    "poses": _packed([seen.pose for seen in stops], "<f4"),
+                }
+                for sensor, stops in self.stops.items()
+            },
+        }
+
+    @classmethod
+    def loaded(cls, saved: Any) -> CameraPath:
+        """Return a saved path. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        spacing = float(saved["spacing"])
+        if not SPACING_M <= spacing < FARTHEST:
+            raise ValueError(f"camera_path: spacing {spacing:g}")
+        stops = {sensor: _stops_from(one) for sensor, one in saved["stops"].items()}
+        if sum(map(len, stops.values())) > MAX_STOPS:
+            raise ValueError(f"camera_path: more than {MAX_STOPS} poses")
+        return cls(spacing, stops)
+
+    def _is_far(self, before: Seen, now: Seen) -> bool:
+        metres, radians = apart(before.pose, now.pose)
+        return metres >= self.spacing or radians >= 2 * self.spacing
+
+    def _thinned(self, stops: list[Seen]) -> list[Seen]:
+        kept = stops[:1]
+        for seen in stops[1:]:
+            if self._is_far(kept[-1], seen):
+                kept.append(seen)
+        return kept
+
+    def __deepcopy__(self, memo: Any) -> CameraPath:
+        """Return an independent copy; the poses themselves never change."""
+        return CameraPath(self.spacing, {sensor: stops.copy() for sensor, stops in self.stops.items()})
+
+
+def _packed(numbers: Any, dtype: str) -> str:
+    return base64.b64encode(np.asarray(numbers, dtype).tobytes()).decode("ascii")
+
+
+def _unpacked(text: Any, dtype: str) -> NDArray[Any]:
+    if not isinstance(text, str) or len(text) > 8 * POSE * MAX_STOPS:
+        raise ValueError("camera_path: no packed numbers")
+    return np.frombuffer(base64.b64decode(text, validate=True), dtype)
+
+
+def _stops_from(saved: Any) -> list[Seen]:
+    stamps, numbers = _unpacked(saved["stamps_ns"], "<i8"), _unpacked(saved["poses"], "<f4")
+    if len(numbers) != POSE * len(stamps) or not (np.abs(numbers) <= FARTHEST).all():  # False for NaN
+        raise ValueError("camera_path: poses that cannot be")
+    poses = map(tuple, numbers.reshape(-1, POSE).tolist())
+    return [Seen(stamp_ns, pose) for stamp_ns, pose in zip(stamps.tolist(), poses, strict=True)]

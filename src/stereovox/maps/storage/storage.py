@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Storage of a voxel map: its blocks, the times of their cells, its settings and history.
+
+`VoxelMap` answers its users from it; whatever reads or writes whole blocks uses it as `voxel_map.storage`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.config import Config
+from stereovox.errors import ConfigError, StereovoxError
+from stereovox.frame import Viewpoint
+from stereovox.kernels.threads import Guarded, MapLock, in_steps
+from stereovox.maps.cells import _add, _pool
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.cells.cell_pool import CellPool
+from stereovox.maps.cells.cell_times import NEVER, CellTimes
+from stereovox.maps.cells.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
+from stereovox.maps.query import queries
+from stereovox.maps.query.queries import INDEX_LIMIT
+from stereovox.maps.record.frame_agreement import Agreement, agreement
+from stereovox.maps.record.history import History, WithHistory
+from stereovox.maps.record.kept_frames import KeptFrames
+from stereovox.maps.storage.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
+from stereovox.maps.storage.tiles import TileStore
+
+EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
+"""Lowest block that `Storage.blocks_within` may be asked for, and the first beyond the highest."""
+
+NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms", "amcl", "slam", "loops"}
+"""Settings that do not change what a frame that was taken says; `map` is compared by itself."""
+
+Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
+"""Block coordinates (n, 3), and their cells (n, 512) as they are stored."""
+
+
+def settings_of_frames(config: Config) -> list[str]:
+    """Return the names of the settings, but for `map`, that say what a frame means that was taken."""
+    return [name for name in type(config).model_fields if name not in NOT_OF_FRAMES]
+
+
+class OnStorage(WithHistory):
+    """Attributes of a map that its storage keeps; like plain attributes they are read without the lock."""
+
+    storage: Any
+
+    @property
+    def config(self) -> Config:
+        """The settings the map was made with."""
+        return self.storage.config
+
+    @property
+    def voxel_size(self) -> float:
+        """Side of a cell in metres: `config.voxel_size`."""
+        return self.storage.config.voxel_size
+
+    @property
+    def history(self) -> History:
+        """What the map remembers of its frames."""
+        return self.storage.history
+
+    @history.setter
+    def history(self, history: History) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.storage.history = history
+
+
+class Storage(Guarded):
+    """The blocks of a map without bounds, in memory.
+
+    Attributes:
+        lock: Held by each call, and by those of the map.
+        config: The settings.
+        history: What the map remembers of its frames.
+        viewpoint: Where the camera stood last; None before the first frame.
+        window_state: Where the window was, for a map that has or had one.
+        listeners: Called with the evidence after every `add`, the lock held. No other block has changed, but for those
+            that a window or time took away. After a correction of poses with `uniform` evidence of 0 on all blocks
+            that were made anew.
+        kept: The depth images of all frames; None where they are not kept.
+        rules: What stored numbers mean.
+        cell_format: How log-odds are stored.
+    """
+
+    bounded = False
+    """Whether memory limits what cells the map can take."""
+
+    def __init__(self, config: Config):
+        self.lock = MapLock()
+        self.config = config
+        self.history = History()
+        self.viewpoint: Viewpoint | None = None
+        self.window_state: dict[str, Any] | None = None
+        self.listeners: list[Callable[[Evidence], None]] = []
+        self.kept: KeptFrames | None = None
+        self.rules = CellRules(config.map)
+        self.cell_format = self.rules.format
+        self._most_rise = self.rules.most_rise
+        self._pool = CellPool(self.rules)
+        self._times = CellTimes(config.map) if config.map.keep_times else None
+
+    def check_cells(self, config: Config) -> None:
+        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section.
+
+        Where a map that kept its frames goes on keeping them, also when these would be mapped otherwise.
+        """
+        for name in ("voxel_size", "steps"):
+            self._check_same(name, getattr(self.config, name), getattr(config, name))
+        of_frames = {"keep_frames": config.map.keep_frames, "frames_budget": config.map.frames_budget}
+        self._check_same("map", self.config.map.model_copy(update=of_frames), config.map)
+        if self.kept is not None and config.map.keep_frames:
+            for name in settings_of_frames(config):
+                self._check_same(name, getattr(self.config, name), getattr(config, name))
+
+    @staticmethod
+    def _check_same(name: str, old: Any, new: Any) -> None:
+        if old != new:
+            raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+
+    def continue_with(self, config: Config) -> None:
+        """Take over the settings of a run that goes on with this map; raises ConfigError as `check_cells` does."""
+        self.check_cells(config)
+        self.config = config
+
+    def check_can_grow(self) -> None:
+        """Raise StereovoxError where nothing can be added to this map; here it can."""
+
+    def take_history(self, earlier: Storage) -> None:
+        """Take over what `earlier` remembers of its frames."""
+        self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
+
+    def fill(self, other: Storage, blocks: Iterable[Blocks]) -> None:
+        """Put `blocks` of another map into this one, with their times, and take over its history."""
+        for coords, cells in blocks:
+            self.insert(coords, cells)
+            if self._times is not None:
+                self.set_times(coords, other.times_of(coords), other.times_start_ns)
+        self.take_history(other)
+
+    @property
+    def tile_store(self) -> TileStore | None:
+        """Where cells outside a window are kept, if they are: nowhere here."""
+        return None
+
+    @property
+    def coords_in_memory(self) -> NDArray[np.int32]:
+        """Coordinates (n, 3) of the blocks that are in memory, in no order."""
+        return self._pool.block_coords
+
+    def make_anew(self, coords: NDArray[np.int32], other: Storage) -> None:
+        """Take over blocks (n, 3) from a map of the same settings, with their times; unknown where it has none."""
+        coords = np.ascontiguousarray(coords, np.int32)
+        self._pool.remove(coords)
+        if self._times is not None:
+            self._times.remove(coords)
+        found, cells = other._pool.get(coords)
+        self.insert(found, cells)
+        if self._times is not None:
+            self._times.put(found, other.times_of(found))
+
+    def become(self, other: Storage) -> None:
+        """Take over all cells of a map of the same settings, which must not be used any more."""
+        self._pool, self._times = other._pool, other._times
+        self.viewpoint, self.window_state = other.viewpoint, other.window_state
+
+    def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost.
+
+        Raises StereovoxError for arrays of other shapes.
+        """
+        if coords.ndim != 2 or coords.shape[1] != 3 or cells.shape != (len(coords), CELLS):
+            raise StereovoxError(f"blocks are {coords.shape} with cells {cells.shape}; give (n, 3) and (n, {CELLS})")
+        cells = np.clip(cells, self.rules.lowest, self.rules.highest)
+        self._pool.put(coords, cells.astype(self.cell_format.dtype, copy=False))
+        if self._times is not None:
+            self._times.remove(coords)
+
+    def look_from(self, viewpoint: Viewpoint) -> None:
+        """Set where the camera stands; a bounded map moves with it, cells without evidence for long are forgotten."""
+        before, self.viewpoint = self.viewpoint, viewpoint
+        if self._times is not None:
+            self._times.forget(self._pool, (before or viewpoint).stamp_ns, viewpoint.stamp_ns)
+
+    def check_room(self, evidence: Evidence) -> None:
+        """Do nothing: memory is not bounded here. Storage that is raises FrameRefused `memory_full`."""
+
+    def agreement(self, evidence: Evidence, firm: int) -> Agreement:
+        """Return how far `evidence` agrees with what the map is sure of.
+
+        firm: evidence of a hit, in thousandths, below which it may be noise.
+        """
+        return agreement(self.stored_cells, self.rules, evidence, firm)
+
+    def add(self, evidence: Evidence) -> int:
+        """Add the evidence of one frame; return the number of cells whose value changed."""
+        if not (len(evidence.coords) or len(evidence.uniform)):
+            return 0
+        mine = self._in_my_units(evidence)
+        if self._times is not None:
+            self._times.write(mine, self._now_ns)
+        changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_values, self.config.threads)
+        for listener in self.listeners:
+            listener(mine)
+        return changed
+
+    @property
+    def stored_cells(self) -> StoredCells:
+        """What kernels that only read need; valid until the map changes."""
+        return self._pool.stored_cells
+
+    def cells_within(self, low: ArrayLike, high: ArrayLike) -> StoredCells:
+        """Return cells that hold those with indices (3,) from `low` to below `high`, as `stored_cells` does: all here.
+
+        For maps that are not all in memory, which read what is asked for.
+        """
+        return self.stored_cells
+
+    def cells_of(self, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 512) as stored of blocks (n, 3) in memory; all unknown where there is none."""
+        return self._cells_in(self.stored_cells, coords)
+
+    def stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
+        """Return the stored numbers (N,) of the cells at points (N, 3) as `queries.points_of` returns them."""
+        return queries.stored_at(self.stored_cells, self.config.cell, points)
+
+    def blocks(self) -> Blocks:
+        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
+        coords, values = zip(*self.slabs(), strict=True)
+        return np.concatenate(coords), np.concatenate(values)
+
+    def blocks_within(self, low: ArrayLike, high: ArrayLike) -> Blocks:
+        """Return the blocks in memory with coordinates (3,) from `low` to below `high`, in no order.
+
+        Coordinates (n, 3), cells (n, 512) as they are stored; both are copies.
+        """
+        return self._pool.within(np.asarray(low), np.asarray(high))
+
+    def slabs_within(self, low: ArrayLike, high: ArrayLike) -> Iterator[Blocks]:
+        """Yield the blocks with coordinates (3,) from `low` to below `high`, piece by piece as `slabs` does."""
+        for coords, cells in self.slabs():
+            inside = ((coords >= np.asarray(low)) & (coords < np.asarray(high))).all(axis=1)
+            yield coords[inside], cells[inside]
+
+    def slabs(self) -> Iterator[Blocks]:
+        """Yield all blocks as in `blocks`, piece by piece in ascending order; those of a map in boxes box by box.
+
+        If the map changes meanwhile, each piece is as it is at its time; hold `lock` to read one state.
+        """
+        yield from in_steps(self.lock, self._slabs())
+
+    def in_memory(self) -> Iterator[Blocks]:
+        """Yield the blocks that are in memory, as `slabs` does: all, or those of the window."""
+        yield from in_steps(self.lock, self._pool.pieces())
+
+    def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
+        """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 where there is none.
+
+        Raises StereovoxError where the map keeps no times. What they mean: `CellTimes`.
+        """
+        yield from in_steps(self.lock, self._timed())
+
+    def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
+        """Return the times (n, 512) of the cells of blocks (n, 3); they mean something where the cell is known."""
+        return self._kept_times.get(coords)
+
+    def times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
+        """Return the times (N,) of the cells at points (N, 3), NEVER where no cell can be."""
+        times = np.zeros(len(points), np.uint32)
+        within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
+        cells = np.floor(points[within] / self.config.cell).astype(np.int64)
+        blocks, of_cell = blocks_of_cells(cells)
+        x, y, z = (cells & (SIDE - 1)).T
+        times[within] = self.times_of(blocks.astype(np.int32))[of_cell, (x << 6) | (y << 3) | z]
+        return times
+
+    def seconds_ago(self, times: NDArray[np.uint32], now_ns: int | None) -> NDArray[np.float32]:
+        """Return how long before `now_ns` (None: the last frame) times are, in seconds; NaN for NEVER."""
+        return self._kept_times.seconds_ago(times, self._now_ns if now_ns is None else now_ns)
+
+    def set_times(self, coords: NDArray[np.int32], times: NDArray[np.uint32], start_ns: int | None) -> None:
+        """Set the times (n, 512) of blocks (n, 3) that are in the map; they count from `start_ns`."""
+        self._kept_times.put(coords, times)
+        self._kept_times.start_ns = start_ns
+
+    @property
+    def times_start_ns(self) -> int | None:
+        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
+        return None if self._times is None else self._times.start_ns
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes in use: stored numbers, times, block coordinates and hash."""
+        return self._pool.memory_bytes + (0 if self._times is None else self._times.memory_bytes)
+
+    @property
+    def reserved_bytes(self) -> int:
+        """Bytes allocated: those in use, and room to grow (which the system gives when it is first used)."""
+        return self._pool.reserved_bytes + (0 if self._times is None else self._times.reserved_bytes)
+
+    def close(self) -> None:
+        """Remove what is on disk (nothing, unless a window keeps tiles there)."""
+
+    def _slabs(self) -> Iterator[Blocks]:
+        """Yield what `slabs` does; the lock is held while an item is made."""
+        yield from self._pool.pieces()
+
+    def _timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
+        for coords, cells in self._slabs():
+            times = self.times_of(coords)
+            times[cells == self.cell_format.unknown] = NEVER
+            yield coords, cells, times
+
+    @staticmethod
+    def _cells_in(stored: StoredCells, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 512) of blocks (n, 3) as kernels see them."""
+        places = np.empty(len(coords), np.int64)
+        _pool.find_all(stored.table, stored.coords, np.ascontiguousarray(coords, np.int32), places)
+        cells = np.full((len(coords), CELLS), stored.unknown, stored.values.dtype)
+        has_row = (places >= 0) & (places < len(stored.values))
+        cells[has_row] = stored.values[places[has_row]]
+        cells[places >= len(stored.values)] = stored.lowest
+        return cells
+
+    def _in_my_units(self, evidence: Evidence) -> Evidence:
+        """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""
+        factor, most = self.cell_format.per_log_odds / LOG_ODDS_SCALE, self._most_rise
+        if factor == 1 and most is None and evidence.uniform_values.all():
+            return evidence
+        shift = self.cell_format.shift(self.history.frames)
+        values = np.empty_like(evidence.values)
+        _add.rescale(evidence.values, np.float32(factor), np.float32(shift), np.float32(most or LARGEST), values)
+        steps = np.floor(evidence.uniform_values * factor + shift).astype(np.int16)
+        some = steps != 0
+        return Evidence(evidence.coords, values, evidence.uniform[some], steps[some])
+
+    @property
+    def _now_ns(self) -> int:
+        return 0 if self.viewpoint is None else self.viewpoint.stamp_ns
+
+    @property
+    def _kept_times(self) -> CellTimes:
+        if self._times is None:
+            raise StereovoxError("the map does not keep when cells were seen; make it with map.keep_times = true")
+        return self._times

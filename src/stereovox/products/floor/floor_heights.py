@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The height of the floor at each place of a map, or that it is unknown: what all 2-D products measure heights from.
+
+A map's world may begin anywhere: z = 0 of a tracked map is where the camera began. So heights that matter to a robot
+are never measured from the world's origin, unless a user states that the floor lies at a certain height there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.config import Config
+from stereovox.errors import StereovoxError
+from stereovox.kernels.threads import one_state
+from stereovox.maps import VoxelMap
+from stereovox.products.floor.floor_axes import Heights, check_level, floor_axes
+from stereovox.products.floor.floor_search import FloorSearch
+from stereovox.products.floor.ground_surfaces import NO_SURFACE, floor_of, place_of
+
+REACH = 0.5
+"""Metres from the nearest floor that was seen, within which its height holds."""
+NO_FLOOR = "the map shows no floor, so heights above it are unknown and nothing is free"
+CURE = "let the camera see the floor, or state its height in the world: --set scan.floor=Z (export: --floor Z), metres"
+TIE = 1e-4
+"""Cells: lengths that are so near to whole cells are."""
+SMOOTHED = 5
+"""Cells along the sides of the square of which a floor's height is the median: one noisy cell does not lift it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FloorHeights:
+    """The height of the floor at each place of a map, seen from above; row 0 and column 0 are the lowest.
+
+    Attributes:
+        height: (rows, columns) float32, metres along the map's `up` from the world's origin: of the nearest floor that
+            was seen. NaN if there is none at all.
+        away: (rows, columns) float32, horizontal metres to that floor; 0 where it was seen itself, infinite where free
+            space lies deeper, as beyond the edge of a drop.
+        resolution: Side of a cell in metres.
+        origin: x, y, yaw of the corner of cell (0, 0), in the axes of `projection.project`.
+        up: The axis of the map that points up.
+        elsewhere: Height in metres of a floor that is stated to be level everywhere; NaN for one that was found.
+    """
+
+    height: NDArray[np.float32]
+    away: NDArray[np.float32]
+    resolution: float
+    origin: tuple[float, float, float]
+    up: str
+    elsewhere: float = float("nan")
+
+    @classmethod
+    def level(cls, height: float, up: str = "z") -> FloorHeights:
+        """Return a floor that is level everywhere, because the user states so.
+
+        Args:
+            height: Metres along `up` from the world's origin.
+            up: The axis of the map that points up.
+
+        Raises:
+            StereovoxError: The height is not finite.
+        """
+        if not np.isfinite(height):
+            raise StereovoxError(f"floor {height}: give the height of the floor in metres from the world's origin")
+        nothing = np.empty((0, 0), np.float32)
+        return cls(nothing, nothing, 1.0, (0.0, 0.0, 0.0), up, float(height))
+
+    @classmethod
+    def unknown(cls, up: str = "z") -> FloorHeights:
+        """Return a floor whose height is known nowhere."""
+        nothing = np.empty((0, 0), np.float32)
+        return cls(nothing, nothing, 1.0, (0.0, 0.0, 0.0), up)
+
+    @property
+    def known(self) -> bool:
+        """Whether the height is known anywhere."""
+        return bool(np.isfinite(self.elsewhere) or np.isfinite(self.height).any())
+
+    def at(self, points: ArrayLike, reach: float = REACH) -> NDArray[np.float64]:
+        """Return the height of the floor below or above places.
+
+        Args:
+            points: (N, 3) metres, world frame.
+            reach: Metres to the nearest floor that was seen within which its height holds.
+
+        Returns:
+            (N,) metres along `up` from the world's origin; NaN if the floor is unknown there.
+        """
+        x, y, _, _ = floor_axes(self.up)
+        across = np.asarray(points, float).reshape(-1, 3)[:, [x, y]]
+        columns, rows = np.floor((across - self.origin[:2]) / self.resolution + TIE).astype(np.int64).T
+        height, away = self._nearest(rows, columns)
+        return np.where(away <= reach, height, np.nan)
+
+    def layers(
+        self, low: NDArray[np.int64], high: NDArray[np.int64], config: Config, heights: Heights
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+        """Return which layers of a map's cells lie within heights above the floor.
+
+        Args:
+            low: (2,) first column and row, in cells of the map.
+            high: (2,) column and row after the last.
+            config: Settings of the map.
+            heights: Lowest and highest metres above the floor. A cell of which any part lies between them counts, but
+                never the cell that the floor itself lies in.
+
+        Returns:
+            First and last layer (rows, columns) int32 along the map's axis, the first above the last where no floor is
+            known; and whether the floor was seen within REACH (rows, columns).
+        """
+        _, _, up, sign = floor_axes(self.up)
+        side = config.cell[up]
+        height, away = self._within(low, high)
+        known = ~np.isnan(height)
+        floor = np.where(known, height, 0.0)
+        lowest = np.maximum(np.floor((floor + heights[0]) / side + TIE), np.floor(floor / side + TIE) + 1)
+        top = np.ceil((floor + heights[1]) / side - TIE) - 1
+        lowest, top = (lowest, top) if sign > 0 else (-1 - top, -1 - lowest)
+        limits = np.iinfo(np.int32).min // 2, np.iinfo(np.int32).max // 2
+        lowest, top = (np.clip(ends, *limits).astype(np.int32) for ends in (lowest, top))
+        return np.where(known, lowest, limits[1]).astype(np.int32), top, known & (away <= REACH)
+
+    def moved_from(self, before: FloorHeights) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+        """Return first column and row, and those after the last, in cells of the map, between which the floor is no
+        longer as it was; None if nothing moved."""
+        boxes = [one._box() for one in (self, before) if one.height.size]
+        if not boxes:
+            return None
+        low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
+        (height, away), (height_before, away_before) = (one._within(low, high) for one in (self, before))
+        other = (height != height_before) & ~(np.isnan(height) & np.isnan(height_before))
+        other |= (away <= REACH) != (away_before <= REACH)
+        rows, columns = (np.flatnonzero(other.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return None
+        return low + np.array([columns[0], rows[0]]), low + np.array([columns[-1], rows[-1]]) + 1
+
+    def _box(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return first column and row of the picture in cells of the map, and those after the last."""
+        first = np.rint(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
+        return first, first + self.height.shape[::-1]
+
+    def _within(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the nearest height and its distance (rows, columns) in a box of columns of the map."""
+        first, _ = self._box()
+        rows, columns = np.ogrid[low[1] - first[1] : high[1] - first[1], low[0] - first[0] : high[0] - first[0]]
+        return self._nearest(*np.broadcast_arrays(rows, columns))
+
+    def _nearest(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the height of the nearest floor that was seen, NaN for none, and how far away it is in metres.
+
+        rows, columns: of one shape, in cells of this picture; they may lie outside of it.
+        """
+        if not self.height.size:
+            return np.full(rows.shape, self.elsewhere), np.zeros(rows.shape)
+        inside = tuple(np.clip(at, 0, n - 1) for at, n in zip((rows, columns), self.height.shape, strict=True))
+        outside = np.hypot(rows - inside[0], columns - inside[1]) * self.resolution
+        return self.height[inside].astype(float), self.away[inside] + outside
+
+
+def floor_of_map(
+    voxel_map: VoxelMap, stated: FloorHeights | float | None = None, start: ArrayLike | None = None
+) -> FloorHeights:
+    """Return the floor of a map: the level one that is stated, or that `scan.floor` states, or else what is found.
+
+    Args:
+        voxel_map: The map.
+        stated: Metres along the map's `up` from the world's origin, or a floor that was found before; None:
+            `scan.floor`.
+        start: See `find_floor`; with it the floor is found.
+
+    Raises:
+        StereovoxError: As `find_floor`.
+    """
+    if isinstance(stated, FloorHeights):
+        return stated
+    config = voxel_map.config
+    stated = config.scan.floor if stated is None and start is None else stated
+    return find_floor(voxel_map, start) if stated is None else FloorHeights.level(stated, config.up)
+
+
+def known_floor(
+    voxel_map: VoxelMap, stated: FloorHeights | float | None = None, start: ArrayLike | None = None
+) -> FloorHeights:
+    """Return the floor as `floor_of_map`; raises StereovoxError, with the cure, if its height is known nowhere."""
+    floor = floor_of_map(voxel_map, stated, start)
+    if not floor.known:
+        raise StereovoxError(f"{NO_FLOOR}; {CURE}")
+    return floor
+
+
+@one_state
+def find_floor(voxel_map: VoxelMap, start: ArrayLike | None = None) -> FloorHeights:
+    """Find the floor of a map: heights per place, so that it may slope, and have steps of up to 0.1 m.
+
+    The floor is the lowest large surface near and below the camera of the last frame, with room for 1.8 m above it, and
+    what continues it (`floor_search`). Where it was not seen the nearest floor's height stands, with its distance.
+
+    Args:
+        voxel_map: The map.
+        start: (3,) metres, near the floor that counts instead, of several storeys or steps.
+
+    Returns:
+        The floor's height at each place, unknown everywhere if the map shows no floor.
+
+    Raises:
+        StereovoxError: The map is too large or not level, or `start` is no place.
+    """
+    from scipy.ndimage import distance_transform_edt, median_filter
+
+    check_level(voxel_map.config)
+    if voxel_map.bounds() is None:
+        return FloorHeights.unknown(voxel_map.config.up)
+    floor, viewpoint = floor_of(voxel_map), voxel_map.viewpoint
+    here = None if start is None else place_of(floor, start)
+    camera = None if viewpoint is None else place_of(floor, viewpoint.T_world_camera[:3, 3])
+    search = FloorSearch(floor, here, camera)
+    levels = search.levels()
+    if (levels == NO_SURFACE).all():
+        return FloorHeights.unknown(voxel_map.config.up)
+    away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
+    filled = levels[tuple(nearest)]
+    away[(levels == NO_SURFACE) & search.drops(filled)] = np.inf
+    height = (median_filter(filled, SMOOTHED, mode="nearest") - 0.5) * floor.side
+    return FloorHeights(
+        height.astype(np.float32), (away * floor.resolution).astype(np.float32), floor.resolution, floor.origin,
+        voxel_map.config.up,
+    )  # fmt: skip

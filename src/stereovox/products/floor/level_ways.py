@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a vehicle can go at one height without leaving what is known to be free, and the middle of that place."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.query.queries import points_of
+
+CLEAR = 0.3
+"""A step costs as much more than its length as this, in metres, is of the room about it: ways keep to the middle."""
+SIDES = ((1, 0), (0, 1), (1, 1), (1, -1))
+"""Steps to neighbours; each leads both ways."""
+
+
+class LevelWays:
+    """Shortest ways of a ball at one height through columns of cells that are known to be free.
+
+    A column is free where all its cells in a band about the height are. Of a map whose `up` is z.
+
+    Args:
+        voxel_map: The map; what it learns later is not seen.
+        start: (3,) metres, where the ball is.
+        radius: Its radius in metres.
+        half_height: Metres above and below it within which cells must be free.
+        own_radius: Horizontal metres about the start within which unknown and tentative cells are its own place.
+
+    Attributes:
+        start: (3,) metres.
+
+    Raises:
+        StereovoxError: The map is empty or has another `up`, or the numbers make no sense.
+    """
+
+    def __init__(
+        self, voxel_map: VoxelMap, start: ArrayLike, radius: float, half_height: float = 0.3, own_radius: float = 0.0
+    ):
+        if voxel_map.config.up != "z":
+            raise StereovoxError(f"the map's up is {voxel_map.config.up}, not z; map with --level")
+        if not (0 <= radius < np.inf and 0 <= half_height < np.inf and 0 <= own_radius < np.inf):
+            raise StereovoxError(f"radius {radius}, half_height {half_height}, own_radius {own_radius}: give metres")
+        here = points_of(start, "start", wanted="(3,) metres, x y z").astype(float).ravel()
+        bounds = voxel_map.bounds()
+        if bounds is None or here.shape != (3,) or not np.isfinite(here).all():
+            raise StereovoxError(f"start {start}: give a point X, Y, Z in metres, and a map that is not empty")
+        self.start, self._radius, self._cell = here, radius, np.array(voxel_map.config.cell)
+        free, own = self._columns(voxel_map, bounds, half_height, own_radius)
+        self._room = _room(free | own, self._cell)
+
+    def middle(self) -> tuple[NDArray[np.float64], float] | None:
+        """Return the place (3,) it can come to with the most room about it, and that room in metres.
+
+        This is the middle of a room as far as it is known (Chien 2020, 5.1). None where it cannot move at all.
+        """
+        room = np.where(np.isfinite(self._search[0].reshape(self._room.shape)), self._room, -1)
+        best = np.unravel_index(np.argmax(room), room.shape)
+        return (self._place(np.array(best)), float(room[best])) if room[best] > 0 else None
+
+    def way_to(self, goal: ArrayLike, near: float = 0.3) -> NDArray[np.float64] | None:
+        """Return the way (N, 3) in metres from the start to the place nearest to a goal.
+
+        Args:
+            goal: (3,) metres; only x and y count.
+            near: Metres by which the end may miss the goal.
+
+        Returns:
+            Places at the start's height; None where there is no way.
+        """
+        reached = np.flatnonzero(np.isfinite(self._search[0]))
+        if not len(reached):
+            return None
+        places = self._place(np.column_stack(np.unravel_index(reached, self._room.shape)))
+        away = np.linalg.norm(places[:, :2] - np.asarray(goal, float)[:2], axis=1)
+        return None if away.min() > near else self._way(int(reached[np.argmin(away)]))
+
+    def _way(self, column: int) -> NDArray[np.float64]:
+        """Return the way (N, 3) from the start to a column that is reached."""
+        before, columns = self._search[1], [column]
+        while before[columns[-1]] >= 0:
+            columns.append(int(before[columns[-1]]))
+        return np.vstack([self.start, self._place(np.column_stack(np.unravel_index(columns[::-1], self._room.shape)))])
+
+    def _columns(
+        self, voxel_map: VoxelMap, bounds: NDArray[np.float64], half_height: float, own_radius: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which columns (n, m) are free, and which are the vehicle's own place."""
+        low, high = np.minimum(bounds[0], self.start), np.maximum(bounds[1], self.start)
+        low[2], high[2] = self.start[2] - half_height, self.start[2] + half_height
+        first, last = (np.floor(corner / self._cell).astype(int) for corner in (low, high))
+        self._first, shape = first, tuple(last - first + 1)
+        centres = (np.indices(shape).reshape(3, -1).T + first + 0.5) * self._cell
+        states = voxel_map.state(centres).reshape(shape)
+        away = np.linalg.norm(centres.reshape(*shape, 3)[:, :, 0, :2] - self.start[:2], axis=2)
+        own = (away <= own_radius) & (states != State.OCCUPIED).all(axis=2)
+        return (states == State.FREE).all(axis=2), own
+
+    @cached_property
+    def _search(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Lengths of the ways to all columns (n * m,), infinite where there is none, and the column before each."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import dijkstra
+
+        fits, number = self._room > self._radius, self._room.size
+        start = np.floor(self.start / self._cell).astype(int)[:2] - self._first[:2]
+        fits[tuple(start)] = True  # it is there, whatever the map says
+        rows, columns, costs = [], [], []
+        index = np.arange(number).reshape(self._room.shape)
+        for step in SIDES:
+            here, there = _beside(step)
+            both = fits[here] & fits[there]
+            room = np.minimum(self._room[here], self._room[there])[both]
+            rows.append(index[here][both])
+            columns.append(index[there][both])
+            costs.append(np.hypot(*(np.array(step) * self._cell[:2])) * (1 + CLEAR / np.maximum(room, 0.05)))
+        graph = csr_array(
+            (np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(number, number)
+        )
+        lengths, before = dijkstra(graph, False, index[tuple(start)], return_predecessors=True)
+        return lengths, before
+
+    def _place(self, columns: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the middles (..., 3) of columns (..., 2) at the start's height."""
+        flat = (columns + self._first[:2] + 0.5) * self._cell[:2]
+        return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.start[2])], axis=-1)
+
+
+def _room(free: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far from any point of each column (n, m) the nearest one is that is not free, at least."""
+    from scipy.ndimage import distance_transform_edt
+
+    closed = np.pad(free, 1)  # what lies outside is not known
+    between = np.asarray(distance_transform_edt(closed, sampling=cell[:2]))[1:-1, 1:-1]
+    return np.maximum(between - np.hypot(*cell[:2]), 0)
+
+
+def _beside(step: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return the parts of an array whose columns have a neighbour at `step`, and those neighbours."""
+    here = tuple(slice(max(-d, 0), -d if d > 0 else None) for d in step)
+    there = tuple(slice(max(d, 0), d if d < 0 else None) for d in step)
+    return (here[0], here[1]), (there[0], there[1])

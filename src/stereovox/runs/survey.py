@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A quick look at a recording before it is mapped: what it holds, which way is up, which settings suit it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.config import Config
+from stereovox.frame import AnyFrame, Cloud, Frame, StereoFrame
+from stereovox.geometry.se3 import Transform, inverse, rigidity_error, rotation_vector
+from stereovox.products.floor.floor_axes import nearest_axis, up_of, upright_axes
+from stereovox.products.moved import level_transform
+from stereovox.sources.base import Source, Stream
+from stereovox.track.tracker import LEVEL as AHEAD
+
+KINDS = {StereoFrame: "stereo", Frame: "depth", Cloud: "cloud"}
+"""What a recording consists of, by the type of its frames."""
+RIGID = 0.05
+"""Largest entry of abs(R^T R - I) of a pose that is used here."""
+FRAMES = 16
+"""Frames that are read, spread over the recording."""
+USUAL_RANGE_M, USUAL_CELL_M = 5.0, 0.05
+"""What `default` uses, kept where a recording gives no reason for anything else."""
+RANGES_M = (5.0, 8.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
+CELLS_M = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+FAR_SHARE = 0.1
+"""Share of the depths that must lie beyond the usual range to make it longer."""
+NEAR_M = 1.2
+"""A recording whose farthest depths are nearer gets smaller cells."""
+DISPARITY_ERROR_PX, DEPTH_ERROR = 0.5, 0.05
+"""Standard deviation of a disparity, and the largest relative one of a depth that is worth mapping."""
+MAX_CELLS_DEEP = 400
+"""Cells along the longest suggested depth, where the user chose their size."""
+LEVEL_ENOUGH = np.radians(5.0)
+"""Angle up to which the nearest axis is taken for up."""
+PICTURES_UPRIGHT = "pictures are turned upright"
+TILTED, LEVELLED = f"{PICTURES_UPRIGHT}, with --level the map is as well", "the map is turned upright"
+"""What becomes of a world that is not level, in words: of a fleet, of a map, and of one that is made level."""
+LEVEL, UPRIGHT = np.radians(15.0), np.radians(40.0)
+"""A surface counts as horizontal within the first angle; an axis points up within the second."""
+STEADY = 0.75
+"""Length of the mean of the cameras' own up directions; less means that the camera was turned over."""
+TURNED, UPRIGHT_SHARE = 0.5, 0.4
+"""Radians that a camera must turn for its turns to say something, and the share that is about the vertical then."""
+FIRST = 10
+"""Images at the start of which one must be there, to show what is level."""
+HORIZONTAL_SHARE = 0.06
+"""Share of the surface that must be horizontal (floor, tables, ceiling) to confirm which way is up."""
+
+
+class Up(NamedTuple):
+    """Which way is up in the world of a recording.
+
+    axis: the world's axis that is nearest, `z`, `-y` and so on. direction: (3,) unit vector. off: angle between both in
+    radians. sure: whether there is enough evidence to use it. why: the evidence in words.
+    """
+
+    axis: str
+    direction: NDArray[np.float64]
+    off: float
+    sure: bool
+    why: str
+
+    @property
+    def words(self) -> str:
+        """The direction in words: `up is -y`, or `up is 27 degrees from -y`."""
+        return f"up is {'' if self.off < LEVEL_ENOUGH else f'{np.degrees(self.off):.0f} degrees from '}{self.axis}"
+
+
+class Suggestion(NamedTuple):
+    """Suggested value of a setting, and why, in words."""
+
+    value: float
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What a quick look at a recording found.
+
+    Attributes:
+        name: Name of the recording.
+        kind: `depth`, `stereo` or `cloud`.
+        frames: Number of frames.
+        seconds: Time from the first to the last frame; 0 where the recording has no times.
+        camera: Camera of all frames.
+        read: Number of frames that were read for the figures below.
+        faults: How many of these cannot be used, by reason.
+        posed: Number of frames read that have a pose.
+        extent_m: (3,) metres along the world's axes between the camera's extreme positions; None without poses.
+        depth_m: (3,) metres: 5th, 50th and 95th percentile of the depths; None for stereo pairs.
+        without_value: Share of pixels without depth; None for stereo pairs.
+        depths_m: (N,) metres, a sample of all depths; empty for stereo pairs.
+        unit: Unit of the depth images in words; None where it is not known.
+        unit_m: The same in metres.
+        unit_sure: Whether the images themselves confirm it.
+        unit_why: What speaks for the unit.
+        up: Which way is up; None without poses.
+        max_range: Suggested longest depth in metres.
+        voxel_size: Suggested side of a cell in metres.
+        notes: What the recording itself notes: assumptions, files left out.
+    """
+
+    name: str
+    kind: str
+    frames: int
+    seconds: float
+    camera: PinholeCamera
+    read: int
+    faults: Counter[str]
+    posed: int
+    extent_m: NDArray[np.float64] | None
+    depth_m: NDArray[np.float64] | None
+    without_value: float | None
+    depths_m: NDArray[np.float64]
+    unit: str | None
+    unit_m: float | None
+    unit_sure: bool
+    unit_why: str
+    up: Up | None
+    max_range: Suggestion
+    voxel_size: Suggestion
+    notes: tuple[str, ...]
+
+    def settings(self, given: Mapping[str, Any], tilted: str = TILTED) -> tuple[dict[str, Any], list[str]]:
+        """Choose the settings that the recording itself suggests.
+
+        Args:
+            given: Settings that the user chose, which are kept.
+            tilted: What is said to become of a world that is not level.
+
+        Returns:
+            Settings by name, and lines that say which, why, and how to override them.
+        """
+        chosen, lines = self._size_settings(given)
+        up, said = self.up_settings(given, tilted)
+        return {**chosen, **up}, [*lines, *said]
+
+    def _size_settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+        chosen: dict[str, Any] = {}
+        if "max_range" not in given and self.max_range.value != USUAL_RANGE_M:
+            most = MAX_CELLS_DEEP * given.get("voxel_size", np.inf)
+            chosen["max_range"] = max(
+                (m for m in RANGES_M if m <= min(self.max_range.value, most)), default=RANGES_M[0]
+            )
+        cell = self.voxel_size if "max_range" not in given else suggest_cell(self.depths_m, given["max_range"])
+        if not {"voxel_size", "steps"} & set(given) and cell.value != USUAL_CELL_M:
+            chosen["voxel_size"] = cell.value
+        if not chosen:
+            return {}, []
+        words = {"max_range": "depth up to {:g} m", "voxel_size": "cells of {:g} m"}
+        options = {"max_range": "--max-range", "voxel_size": "--voxel-size"}
+        what = ", ".join(words[name].format(value) for name, value in chosen.items())
+        why = self.max_range.why if "max_range" in chosen else cell.why
+        return chosen, [f"{what} ({why}); else give {' or '.join(options[name] for name in chosen)}"]
+
+    def up_settings(self, given: Mapping[str, Any], tilted: str = TILTED) -> tuple[dict[str, Any], list[str]]:
+        """Choose which way is up.
+
+        Args:
+            given: Settings that the user chose, which are kept.
+            tilted: As for `settings`.
+
+        Returns:
+            As `settings`, about up alone.
+        """
+        if self.up is None or {"up", "up_direction"} & set(given):
+            return {}, []
+        if not self.up.sure:
+            likely = f", perhaps {self.up.axis}" if self.up.axis != "z" else ""
+            return {}, [
+                f"which way is up is not certain{likely} ({self.up.why}); z is assumed, else give --set up=AXIS"
+            ]
+        if self.up.off < LEVEL_ENOUGH:
+            level, chosen = "", {"up": self.up.axis}
+        else:
+            level = f"{tilted}; "
+            direction = tuple(round(float(part), 4) for part in self.up.direction)
+            chosen = {"up": self.up.axis, "up_direction": direction}
+        if chosen == {"up": "z"}:
+            return {}, []
+        return chosen, [f"{self.up.words} ({self.up.why}); {level}else give --set up=AXIS"]
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Frames a second; None where the recording has no times."""
+        return (self.frames - 1) / self.seconds if self.seconds > 0 else None
+
+
+def survey(source: Source, frames: int = FRAMES) -> Survey:
+    """Look at a recording.
+
+    Args:
+        source: The recording, from `open_source`.
+        frames: Number of frames to read.
+
+    Returns:
+        What was found; a frame that cannot be read only counts in `faults`.
+    """
+    numbers = np.unique(np.linspace(0, len(source) - 1, min(frames, len(source))).astype(int)).tolist()
+    read = [source.frame(i) for i in numbers]
+    posed = [frame for frame in read if _has_pose(frame)]
+    images = [frame for frame in read if isinstance(frame, Frame) and frame.depth.size]
+    depths = [_depth_m(frame) for frame in images] + [_ranges(frame) for frame in read if isinstance(frame, Cloud)]
+    valid = np.concatenate([np.empty(0), *(depth[np.isfinite(depth)] for depth in depths)])
+    pixels = sum(depth.size for depth in depths)
+    max_range = suggest_range(valid, source.camera, stereo=isinstance(read[0], StereoFrame))
+    positions = np.array([frame.T_world_sensor[:3, 3] for frame in posed])
+    unit = getattr(source, "unit", None)
+    return Survey(
+        name=source.name,
+        kind=KINDS[type(read[0])],
+        frames=len(source),
+        seconds=(read[-1].stamp_ns - read[0].stamp_ns) / 1e9,
+        camera=source.camera,
+        read=len(read),
+        faults=Counter(frame.fault for frame in read if frame.fault),
+        posed=len(posed),
+        extent_m=np.ptp(positions, axis=0) if len(posed) else None,
+        depth_m=np.percentile(valid, [5, 50, 95]) if valid.size else None,
+        without_value=1 - valid.size / pixels if pixels else None,
+        depths_m=valid,
+        unit=None if unit is None else unit.words,
+        unit_m=None if unit is None else unit.scale,
+        unit_sure=unit is not None and unit.sure,
+        unit_why="" if unit is None else unit.why,
+        up=find_up(source, posed) if posed else None,
+        max_range=max_range,
+        voxel_size=suggest_cell(valid, max_range.value),
+        notes=tuple(getattr(source, "notes", ())),
+    )
+
+
+def find_up(source: Any, frames: list[AnyFrame]) -> Up:
+    """Find out which way is up: as the layout defines it (`source.up`), by an accelerometer, else by what was seen.
+
+    A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
+    world; horizontal surfaces near it, such as floors and tables, then give the direction and confirm it.
+
+    Args:
+        source: The recording.
+        frames: Some of its frames, with poses.
+
+    Returns:
+        The direction; not `sure` where the camera was turned over or saw no horizontal surface.
+    """
+    known = getattr(source, "up", None)
+    if known:
+        return Up(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
+    gravity = source.gravity() if hasattr(source, "gravity") else None
+    if gravity is not None:
+        axis, off = _axis_near(gravity)
+        return Up(axis, gravity, off, True, "by the accelerometer")
+    mean = np.mean([_own_up(frame) for frame in frames], axis=0)
+    steady = float(np.linalg.norm(mean))
+    if steady < STEADY:
+        axis = nearest_axis(mean) if steady > 0 else "z"
+        return Up(axis, mean, float("nan"), False, "the camera was turned over on its way")
+    normals = [_normals(frame) for frame in frames if isinstance(frame, Frame) and frame.depth.size]
+    normals = np.concatenate([np.empty((0, 3)), *normals])
+    direction, share = _level_direction(mean / steady, normals)
+    axis, off = _axis_near(direction)
+    if _turns_level(frames, direction):
+        return Up(axis, direction, off, False, "the camera hardly turned about what is up in its images")
+    if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
+        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
+    sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
+    why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
+    return Up(axis, direction, off, sure, why)
+
+
+def _axis_near(direction: NDArray[np.float64]) -> tuple[str, float]:
+    """Return the axis nearest to a unit vector (3,), and the angle between both in radians."""
+    axis = nearest_axis(direction)
+    return axis, float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
+
+
+def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:
+    """Return whether a camera turned mostly about axes that are level if `up` (3,) is right.
+
+    People and robots look round about the vertical: then it was held on its side.
+    """
+    R = [frame.T_world_sensor[:3, :3] for frame in frames]
+    turns = np.array([before @ rotation_vector(before.T @ after) for before, after in pairwise(R)]).reshape(-1, 3)
+    whole = float(np.linalg.norm(turns, axis=1).sum())
+    return whole > TURNED and float(np.abs(turns @ up).sum()) < UPRIGHT_SHARE * whole
+
+
+def level_start(source: Stream, config: Config) -> Transform:
+    """Return the pose (4, 4) of the first image of a camera that is tracked, in the world of its map.
+
+    The camera is at the origin. What is up follows from floors, tables and ceilings in the first image, where it shows
+    some near the vertical of the image; else the camera is taken to be level.
+    """
+    return level_pose(next(_first_images(source), None), config)
+
+
+def level_pose(first: Frame | None, config: Config) -> Transform:
+    """Return the same, (4, 4), of a first image; None: none shows what is level."""
+    found = None if first is None else find_up(None, [replace(first, T_world_sensor=AHEAD, fault=None)])
+    tilt = level_transform(found.direction) if found is not None and found.sure else np.eye(4)
+    return level_world(config) @ tilt @ AHEAD
+
+
+def level_world(config: Config) -> Transform:
+    """Return the motion (4, 4) from a world whose z axis is up into one in which it is the axis of the settings."""
+    return inverse(level_transform(up_of(config)))
+
+
+def _first_images(source: Stream) -> Iterator[Frame]:
+    """Yield depth images at the start of a recording."""
+    if source.length is None or not hasattr(source, "frame"):
+        return
+    for i in range(min(FIRST, source.length)):
+        frame = source.frame(i)  # pyright: ignore[reportAttributeAccessIssue] - it can be read in any order
+        if isinstance(frame, Frame) and frame.depth.size:
+            yield frame
+
+
+def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bool) -> Suggestion:
+    """Suggest the longest depth that is worth mapping.
+
+    depths: (N,) metres of a sample of pixels; empty for stereo pairs, which are not matched for this.
+    """
+    baseline = camera.baseline
+    precise = DEPTH_ERROR * camera.fx * baseline / DISPARITY_ERROR_PX if baseline else np.inf
+    if stereo:
+        value = max((m for m in RANGES_M if m <= 1.1 * precise), default=RANGES_M[0])
+        error = f"{100 * DEPTH_ERROR:.0f} % depth error at {precise:.0f} m"
+        return Suggestion(value, f"a baseline of {baseline or 0:.2g} m gives {error}")
+    far = float(np.mean(depths > USUAL_RANGE_M)) if depths.size else 0.0
+    if far < FAR_SHARE:
+        return Suggestion(
+            USUAL_RANGE_M, f"{100 * far:.0f} % of the depths lie beyond" if far >= 0.005 else "no depth lies beyond"
+        )
+    needed = float(np.percentile(depths, 95))
+    fitting = [m for m in RANGES_M if m <= 1.1 * precise]
+    value = next((m for m in fitting if m >= 0.95 * needed), max(fitting, default=USUAL_RANGE_M))
+    limit = f", the baseline is good to {precise:.1f} m" if value < 0.95 * needed else ""
+    return Suggestion(value, f"{100 * far:.0f} % of the depths lie beyond {USUAL_RANGE_M:g} m{limit}")
+
+
+def suggest_cell(depths: NDArray[np.float64], max_range: float) -> Suggestion:
+    """Suggest the side of a cell for depths (N,) in metres of a sample of pixels, and the range that is mapped."""
+    if max_range > USUAL_RANGE_M:
+        value = next((side for side in CELLS_M if side >= max_range / 200), CELLS_M[-1])
+        return Suggestion(max(value, USUAL_CELL_M), f"a range of {max_range:g} m")
+    farthest = float(np.percentile(depths, 95)) if depths.size else USUAL_RANGE_M
+    if farthest < NEAR_M:
+        return Suggestion(max(side for side in CELLS_M if side <= max(farthest / 100, CELLS_M[0])), "a near scene")
+    return Suggestion(USUAL_CELL_M, "the usual size")
+
+
+def _has_pose(frame: AnyFrame) -> bool:
+    return not frame.fault and rigidity_error(frame.T_world_sensor) < RIGID
+
+
+def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
+    """Return the direction (3,) in the world that is up where a sensor stands upright: lidars have other axes."""
+    return frame.T_world_sensor[:3, 2] if isinstance(frame, Cloud) else -frame.T_world_sensor[:3, 1]
+
+
+def _ranges(cloud: Cloud) -> NDArray[np.float64]:
+    """Return a sample of a cloud's ranges in metres, NaN where there is none."""
+    ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
+    return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
+
+
+def _depth_m(frame: Frame) -> NDArray[np.float64]:
+    """Return a sample of an image's depths in metres, NaN where there is none."""
+    step = max(1, frame.depth.shape[1] // 160)
+    depth = frame.depth[::step, ::step].astype(np.float64)
+    depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan
+    if frame.depth.dtype == np.uint16:
+        depth[depth == 65535] = np.nan
+    return depth * frame.depth_scale
+
+
+def _normals(frame: Frame) -> NDArray[np.float64]:
+    """Return unit normals (N, 3) of surfaces in the world, towards the camera."""
+    camera = frame.camera
+    if not isinstance(camera, PinholeCamera):
+        return np.empty((0, 3))
+    step = max(1, frame.depth.shape[1] // 160)
+    depth = _depth_m(frame)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] * step
+    points = np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth], axis=-1)
+    beside = 2
+    across = points[beside:-beside, 2 * beside :] - points[beside:-beside, : -2 * beside]
+    down = points[2 * beside :, beside:-beside] - points[: -2 * beside, beside:-beside]
+    here = points[beside:-beside, beside:-beside]
+    normals = np.cross(down, across)
+    length = np.linalg.norm(normals, axis=-1)
+    jump = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1)) > 0.3 * here[..., 2]
+    usable = np.isfinite(length) & (length > 0) & ~jump
+    normals = normals[usable] / length[usable][:, None]
+    normals *= -np.sign((normals * here[usable]).sum(axis=1))[:, None]
+    return normals @ frame.T_world_sensor[:3, :3].T
+
+
+def _level_direction(start: NDArray[np.float64], normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the normal of horizontal surfaces near `start` (3,), and the share of all that is horizontal.
+
+    Ceilings count, turned over. Mean shift, from a wide angle to a narrow one.
+    """
+    direction = start
+    for angle in np.linspace(np.radians(40), LEVEL, 6):
+        along = normals @ direction
+        near = np.abs(along) > np.cos(angle)
+        if near.sum() < max(30, 0.02 * len(normals)):
+            return start, 0.0
+        mean = (normals[near] * np.sign(along[near])[:, None]).mean(axis=0)
+        direction = mean / np.linalg.norm(mean)
+    if start @ direction < np.cos(np.radians(45)):
+        return start, 0.0
+    return direction, float(np.mean(np.abs(normals @ direction) > np.cos(LEVEL)))

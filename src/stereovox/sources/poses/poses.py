@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses over time, interpolated at the time of an image."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from decimal import Decimal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.geometry.se3 import Transform, interpolate
+
+MAX_GAP_NS = 100_000_000
+"""An image whose neighbouring poses are 0.1 s or more away, on either side, has no pose."""
+
+
+class Poses:
+    """Poses of a body (a camera, a tracker) in a world, each with a time; in order of time, no time twice.
+
+    stamps_ns: (N,) int64 nanoseconds, in any order; of several with one stamp the first counts.
+    T_world_body: (N, 4, 4) float64, in the same order. NaN marks a pose that cannot be used: it is remembered, and
+        whatever needs it is refused.
+    confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None where it is not known.
+    where: what the poses came from, for messages: a file or topic.
+    faults: why poses cannot be used, by stamp; one line each with the cure.
+    repeated: how many poses were left out, since another one with their stamp came before.
+    Raises SourceError where there is no pose at all or the arrays do not fit together.
+    """
+
+    def __init__(
+        self,
+        stamps_ns: ArrayLike,
+        T_world_body: ArrayLike,
+        confidence: ArrayLike | None = None,
+        *,
+        where: str = "poses",
+        faults: Mapping[int, str] | None = None,
+    ):
+        stamps, T = np.asarray(stamps_ns, np.int64), np.asarray(T_world_body, float)
+        if not stamps.size:
+            raise SourceError(f"{where}: holds no pose; give at least two")
+        trust = stamps if confidence is None else np.asarray(confidence, float)
+        if stamps.ndim != 1 or T.shape != (len(stamps), 4, 4) or trust.shape != stamps.shape:
+            raise SourceError(f"{where}: {T.shape} poses for {stamps.shape} times; give (N,) times and (N, 4, 4) poses")
+        self.stamps_ns, first = np.unique(stamps, return_index=True)
+        self.T_world_body = T[first]
+        self.repeated = len(stamps) - len(first)
+        self.confidence = None if confidence is None else trust[first]
+        self.where = where
+        self.faults = dict(faults or {})
+        self._stamps: list[int] = self.stamps_ns.tolist()
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between the neighbours before and after.
+
+        Straight line in position, constant turn rate in rotation.
+        Raises FrameRefused: `no_pose` where one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
+        where a neighbour cannot be used.
+        """
+        before, after = self.neighbours(stamp_ns)
+        if before == after:
+            return self._pose(before).copy()
+        start, end = self._stamps[before], self._stamps[after]
+        return interpolate(self._pose(before), self._pose(after), (stamp_ns - start) / (end - start))
+
+    def neighbours(self, stamp_ns: int) -> tuple[int, int]:
+        """Return the numbers of the poses before and after `stamp_ns`, twice the same where one has that very time.
+
+        Raises FrameRefused `no_pose` where one of them is missing or 0.1 s or more away.
+        """
+        stamp_ns = int(stamp_ns)
+        after = bisect_left(self._stamps, stamp_ns)
+        if after < len(self._stamps) and self._stamps[after] == stamp_ns:
+            return after, after
+        self._check_gap(stamp_ns, after)
+        return after - 1, after
+
+    def _check_gap(self, stamp_ns: int, after: int) -> None:
+        gaps = {
+            "before": stamp_ns - self._stamps[after - 1] if after else None,
+            "after": self._stamps[after] - stamp_ns if after < len(self._stamps) else None,
+        }
+        for side, gap in gaps.items():
+            if gap is None or gap >= MAX_GAP_NS:
+                found = "there is none" if gap is None else f"the nearest is {gap / 1e9:.3f} s away"
+                wanted = f"needs a pose less than {MAX_GAP_NS / 1e9:g} s {side} {stamp_ns / 1e9:.3f} s"
+                raise FrameRefused("no_pose", f"{self.where}: {wanted}, {found}; leave the image out or add poses")
+
+    def _pose(self, k: int) -> NDArray[np.float64]:
+        T = self.T_world_body[k]
+        if np.isfinite(T).all():
+            return T
+        stamp_ns = self._stamps[k]
+        said = self.faults.get(stamp_ns, f"{self.where}: the pose at {seconds_from_ns(stamp_ns)} s cannot be used")
+        raise FrameRefused("bad_pose_file", said)
+
+
+class UnknownPoses:
+    """The poses of a recording whose poses were not looked for: all NaN."""
+
+    def at(self, i: int) -> Transform:
+        """Return NaN (4, 4), whatever number or time `i` is."""
+        return np.full((4, 4), np.nan)
+
+
+def seconds_from_ns(stamp_ns: int) -> str:
+    """Return nanoseconds as seconds with all nine decimals."""
+    return f"{Decimal(int(stamp_ns)).scaleb(-9):.9f}"

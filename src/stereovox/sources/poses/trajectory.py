@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses over time from text files of the TUM format, and the stamped lines of its other files."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path, PurePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import SourceError
+from stereovox.files.safe_io import MAX_LIST, read_text, replacing
+from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.poses import seconds_from_ns as seconds_from_ns
+
+LIMIT = 9_223_372_036
+"""Seconds whose nanoseconds still fit into int64."""
+TRAJECTORY_ENDINGS = (".tum", ".txt")
+FORMAT = "stamp tx ty tz qx qy qz qw"
+StampedLine = tuple[int, str, str]
+"""Time in nanoseconds, the rest of the line, and `file:line` for messages."""
+
+
+class Trajectory(Poses):
+    """Poses in a file of lines `stamp tx ty tz qx qy qz qw`: seconds, metres, quaternion of any length but zero.
+
+    Lines may be in any order; of several with one stamp the first counts. A line that has a stamp but no usable pose
+    is remembered, and whatever needs it is refused.
+    Raises SourceError with file and line where a stamp is unreadable, or where there is no line at all.
+    """
+
+    def __init__(self, path: Path):
+        lines = pose_lines(path, FORMAT)
+        numbers, faults = pose_numbers(lines, 7, FORMAT)
+        super().__init__([line[0] for line in lines], transforms(numbers), where=str(path), faults=faults)
+
+
+def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[np.float64], whose: str) -> None:
+    """Write poses (N, 4, 4) as lines of the TUM format, all or nothing; `whose`: what is posed, for the first line.
+
+    Raises MapFileError where the file cannot be written; an older one is then still there.
+    """
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    with replacing(path) as file:
+        file.write(f"# stamp tx ty tz qx qy qz qw: {whose}\n".encode())
+        for stamp_ns, place, quaternion in zip(stamps_ns, poses[:, :3, 3], quaternions, strict=True):
+            numbers = [*(f"{x:.6f}" for x in place), *(f"{q:.9f}" for q in quaternion)]
+            file.write(f"{seconds_from_ns(stamp_ns)} {' '.join(numbers)}\n".encode())
+
+
+def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
+    """Return the lines of a file of poses in order of time; raises SourceError where there is none or no stamp."""
+    lines = sorted(stamped_lines(path), key=lambda line: line[0])
+    if not lines:
+        raise SourceError(f"{path}: holds no pose; write lines '{wanted}'")
+    return lines
+
+
+def pose_numbers(lines: Sequence[StampedLine], count: int, wanted: str) -> tuple[NDArray[np.float64], dict[int, str]]:
+    """Return the (N, count) numbers of the lines, NaN where a line is of no use, and by stamp what is wrong there."""
+    rows, faults = np.full((len(lines), count), np.nan), {}
+    for row, (stamp_ns, rest, where) in zip(rows, lines, strict=True):
+        try:
+            row[:] = _numbers(rest, count, wanted)
+        except ValueError as error:
+            faults.setdefault(stamp_ns, f"{where}: {error}; correct or delete the line")
+    return rows, faults
+
+
+def transforms(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 4, 4) motions of (N, 7) numbers tx ty tz qx qy qz qw; NaN stays NaN."""
+    x, y, z, w = (numbers[:, 3:7] / np.linalg.norm(numbers[:, 3:7], axis=1, keepdims=True)).T
+    T = np.zeros((len(numbers), 4, 4))
+    T[:, 3, 3] = 1
+    T[:, :3, 3] = numbers[:, :3]
+    T[:, :3, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], 1)
+    T[:, :3, 1] = np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], 1)
+    T[:, :3, 2] = np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], 1)
+    return T
+
+
+def _numbers(text: str, count: int, wanted: str) -> list[float]:
+    numbers = [float(word) for word in text.split()]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"needs '{wanted}'")
+    if math.hypot(*numbers[3:7]) < 1e-6:
+        raise ValueError("quaternion of length zero")
+    return numbers
+
+
+def stamped_lines(path: Path) -> list[StampedLine]:
+    """Return the lines of `path` that start with a time in seconds, in file order, without comments and empty ones.
+
+    Commas and tabs count as spaces. Raises SourceError naming file and line.
+    """
+    try:
+        text = read_text(path, MAX_LIST, "replace")
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
+    return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
+
+
+def inside(name: str, where: str) -> str:
+    """Return the name of a file that a line of a list gives; raises SourceError where it leads out of the folder."""
+    if os.path.isabs(name) or ".." in PurePath(name).parts or "\0" in name:
+        raise SourceError(f"{where}: '{name}' leads out of the recording's folder; put the file there and name it so")
+    return name
+
+
+def by_time(lines: Iterable[StampedLine]) -> list[StampedLine]:
+    """Return the lines sorted by time, only the first of those with the same stamp."""
+    first: dict[int, StampedLine] = {}
+    for line in lines:
+        first.setdefault(line[0], line)
+    return [first[stamp_ns] for stamp_ns in sorted(first)]
+
+
+def ns_from_seconds(text: str) -> int:
+    """Return the exact nanoseconds of a decimal number of seconds; digits beyond the ninth are rounded.
+
+    A float would be off by up to 120 ns for today's dates. Raises ValueError for what is no number or too large for
+    int64.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise ValueError(f"'{text}' is no time in seconds") from None
+    if not (seconds.is_finite() and -LIMIT < seconds < LIMIT):  # abs() may overflow
+        raise ValueError(f"'{text}' is no time in seconds")
+    return round(seconds * 1_000_000_000)
+
+
+def _plain(line: str) -> str:
+    return line.partition("#")[0].replace(",", " ").strip()
+
+
+def _parse(line: str, where: str) -> StampedLine:
+    stamp, *rest = line.split(maxsplit=1)
+    try:
+        return ns_from_seconds(stamp), "".join(rest), where
+    except ValueError as error:
+        raise SourceError(f"{where}: {error}; correct or delete the line") from None

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The colour camera of a connected RealSense, whose pictures help to track it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import cache, partial
+from threading import Lock
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.errors import FrameRefused
+from stereovox.frame import Photo
+from stereovox.geometry.se3 import Transform
+from stereovox.sources.realsense.realsense_sensor import SideSensor, ns_from_ms, transform_between
+from stereovox.sources.rgbd.undistort import Undistortion
+
+WAITING = 6
+"""Newest pictures that are kept for those who track or record depth images a little later."""
+WITHIN_NS, PATIENCE_MS = 20_000_000, 15
+"""How far a picture may be from its depth image, and how long one that is late is waited for."""
+PREFERRED = (640, 480)
+"""Width and height."""
+GREY_FROM: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
+    "yuyv": lambda data: data.reshape(*data.shape[:2], -1)[..., 0],
+    "uyvy": lambda data: data.reshape(*data.shape[:2], -1)[..., 1],
+    "y8": lambda data: data,
+    "rgb8": lambda data: data,
+    "bgr8": lambda data: data[..., ::-1],
+}
+"""Forms that a colour camera may send, the cheapest first, and what is made of each: a grey or an RGB image."""
+
+
+class PhotoSensor(SideSensor):
+    """Returns the picture that was taken with a depth image.
+
+    Args:
+        rs: The library.
+        sensor: The colour camera's sensor.
+        profile: Its mode.
+        T_depth_photo: (4, 4), maps its optical frame into that of the depth camera.
+
+    Raises:
+        RuntimeError, StereovoxError: The camera does not say how it sees.
+    """
+
+    def __init__(self, rs: Any, sensor: Any, profile: Any, T_depth_photo: Transform):
+        super().__init__(rs, sensor, [profile], WAITING)
+        self._T = T_depth_photo
+        lens = profile.get_intrinsics()
+        self.camera = PinholeCamera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
+        self._undistort = Undistortion(self.camera, lens.coeffs)  # RealSense's ROS driver takes them so too
+        self._grey = GREY_FROM[_form(rs, profile)]
+        self._waiting: deque[tuple[int, Any]] = deque(maxlen=WAITING)
+        self._lock = Lock()
+
+    def stop(self) -> None:
+        """Stop taking pictures, and give those that wait back to the library."""
+        with self._lock:
+            self._waiting.clear()
+        super().stop()
+
+    def near(self, stamp_ns: int) -> Photo:
+        """Return the picture nearest to a depth image of that time, which is read once it is needed.
+
+        Its `pixels` wait for 15 ms where only earlier ones have come; they raise FrameRefused where none is within
+        20 ms, or is kept no more.
+        """
+        return Photo(cache(partial(self._pixels, stamp_ns)), self.camera, self._T)
+
+    def _pixels(self, stamp_ns: int) -> NDArray[np.uint8]:
+        with self._lock:
+            return self._read(stamp_ns)
+
+    def _read(self, stamp_ns: int) -> NDArray[np.uint8]:
+        self._take(stamp_ns)
+        stamp, image = min(self._waiting, key=lambda one: abs(one[0] - stamp_ns), default=(0, None))
+        if image is None or abs(stamp - stamp_ns) > WITHIN_NS:
+            raise FrameRefused("no_photo", f"no picture within 20 ms of the depth image at {stamp_ns}")
+        size = self.camera.height, self.camera.width
+        data = np.ascontiguousarray(image.get_data()).view(np.uint8).reshape(*size, -1)
+        grey = self._grey(data if data.shape[2] > 1 else data[..., 0])
+        return np.array(self._undistort(grey))  # a copy: the library uses its memory again
+
+    def _take(self, stamp_ns: int) -> None:
+        """Take in pictures that came, and wait for one that is not older than `stamp_ns`."""
+        until = monotonic() + PATIENCE_MS / 1000
+        while True:
+            while image := self._queue.poll_for_frame():
+                self._waiting.append((ns_from_ms(image.get_timestamp()), image))
+            left_ms = int(1000 * (until - monotonic()))
+            if left_ms <= 0 or not self._waiting or self._waiting[-1][0] >= stamp_ns:
+                return
+            arrived, image = self._queue.try_wait_for_frame(left_ms)
+            if arrived:
+                self._waiting.append((ns_from_ms(image.get_timestamp()), image))
+
+
+def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
+    """Return the colour camera beside a depth camera, in a mode of its rate; None where there is none.
+
+    Raises RuntimeError and StereovoxError where the camera does not say how it sees or where it is.
+    """
+    modes = [
+        (sensor, profile.as_video_stream_profile())
+        for sensor in device.query_sensors()
+        for profile in sensor.get_stream_profiles()
+        if profile.stream_type() == rs.stream.color and _form(rs, profile) and profile.fps() == depth_profile.fps()
+    ]
+    if not modes:
+        return None
+
+    def distance(mode: tuple[Any, Any]) -> tuple[int, int]:
+        size = mode[1].width(), mode[1].height()
+        away = sum(abs(has - want) for has, want in zip(size, PREFERRED, strict=True))
+        return away, list(GREY_FROM).index(_form(rs, mode[1]))
+
+    sensor, profile = min(modes, key=distance)
+    return PhotoSensor(rs, sensor, profile, transform_between(profile, depth_profile))
+
+
+def _form(rs: Any, profile: Any) -> str:
+    """Return the name of a mode's form, nothing where no picture can be made of it."""
+    return next((name for name in GREY_FROM if profile.format() == getattr(rs.format, name)), "")

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layouts of RGB-D recordings, one a module."""

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reproduce the experiments of a paper: one report with its figures beside ours.
+
+All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
+Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
+Thresholds are chosen on other drives than they are scored on, of a single drive on the first half of its street.
+IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is a bag of your own instead.
+A reference map that SLAM's self-check doubts is named, with exit status 3, and no claim holds that stands on it.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from stereovox.cli.terminal import progress_bar, say, say_about_compiling
+
+EXAMPLE = "stereovox reproduce chien2020 --out chien2020"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("paper", metavar="PAPER", help="chien2020, valenti2018 or ist2019")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for report.html and numbers.json")
+    parser.add_argument(
+        "--data", metavar="SOURCE", help="valenti2018: folder of recordings; others: your own recording"
+    )
+    parser.add_argument(
+        "--camera", metavar="NAME", help="chien2020: simulated camera: simple (default), or honest: d435, kinect"
+    )
+    parser.add_argument("--quick", action="store_true", help="few frames: a trial run, not figures to quote")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Run the experiments and print which claims hold."""
+    from stereovox_lab.papers import reproduce
+
+    say_about_compiling()
+    with progress_bar() as bar:
+        task = bar.add_task("starting", note="")
+        result = reproduce(
+            arguments.paper,
+            arguments.out,
+            data=arguments.data,
+            quick=arguments.quick,
+            camera=arguments.camera,
+            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+        )
+    _print_result(result)
+    return result
+
+
+def _print_result(result: dict[str, Any]) -> None:
+    failed, unjudged = result["does_not_hold"], result["cannot_be_judged"]
+    judged = f"{result['holds']} claims hold, {len(failed)} do not, {len(unjudged)} cannot be judged"
+    say(f"{judged}, in {result['seconds']:.0f} s")
+    if result["quick"] and failed:
+        say("only few frames were used (--quick): a claim that fails here may hold for the whole run")
+    for text in failed:
+        say(f"does not hold: {text}")
+    for text in unjudged:
+        say(f"cannot be judged: {text}")
+    for doubt in result.get("doubts", ()):
+        say(f"warning: the reference map of {doubt['experiment']} may be wrong: {doubt['text']}")
+    for name, path in result["files"].items():
+        say(f"{name:>8}: {path}")

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels' decorator and where it keeps machine code."""
+
+import importlib
+import json
+import os
+import pickle
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from operator import attrgetter
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from llvmlite.binding import get_host_cpu_features as host_features
+from packaging.requirements import Requirement
+
+import stereovox as sv
+from stereovox.kernels import _jit
+
+PACKAGE = Path(_jit.__file__).parent
+fresh_cache_folder = _jit.cache_folder.__wrapped__
+ENVIRONMENT = ("STEREOVOX_CACHE", "XDG_CACHE_HOME", "HOME")
+ASK_THE_MAP = """
+import json
+import numpy as np
+from stereovox import VoxelMap, load_config
+from stereovox.kernels._jit import cache_folder
+from stereovox.maps import _pool, _query
+
+voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[0, 0, 0], [9, -9, 3]], [2.0, -1.0])
+stats = [kernel.stats for kernel in (_pool.put, _query.look_up)]
+print(json.dumps({
+    "folder": str(cache_folder()),
+    "log_odds": voxel_map.log_odds([[0.5, 0.5, 0.5], [9.5, -8.5, 3.5], [5, 5, 5]]).tolist(),
+    "hits": sum(sum(s.cache_hits.values()) for s in stats),
+    "misses": sum(sum(s.cache_misses.values()) for s in stats),
+}))
+"""
+MAP_A_FRAME = """
+import json, pickle, sys
+import machine_code
+machine_code.record()
+import stereovox as sv
+from stereovox.depth import _images as depth
+from stereovox.integrate import _hits, _projective, _windows
+from stereovox.maps import _pool as maps
+
+mapper = sv.Mapper(voxel_size=0.1)
+mapper.add(pickle.load(sys.stdin.buffer))
+kernels = [value for room in (depth, _projective, _hits, _windows, maps) for value in vars(room).values()]
+compiled = [kernel for kernel in kernels if getattr(kernel, "signatures", None)]
+assembly = {kernel.py_func.__name__: "".join(kernel.inspect_asm().values()) for kernel in compiled}
+wide = {kernel.py_func.__name__: machine_code.assembly_for(kernel, "skylake-avx512") for kernel in compiled}
+cells = [array.tolist() for array in mapper.map.cells()]
+print(json.dumps({"assembly": assembly, "wide": wide, "cells": cells}))
+"""
+HASWELL = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
+"""Without the second, numba takes a name alone together with all that this processor can do."""
+ARITHMETIC = re.compile(
+    r"^\s+(v?(?:add|sub|mul|div|sqrt|min|max|round|rndscale|hadd|hsub|addsub|cmp\w*|cvt\w+2|fn?m\w+)pd|vcvtt?pd2\w+)"
+    r"\s.*%[yz]mm",
+    re.MULTILINE,
+)
+"""Instructions that compute with wide vectors of doubles, or convert them; others just move 64 bits of anything.
+
+In an xmm register they are no loop: without AVX-512 a single whole number of 64 bits is made a double in this way.
+"""
+ASK_THE_PROBE = "from stereovox._probe import f; print(f(1))"
+
+
+def run(program, data=b"", **environment):
+    kept = {name: value for name, value in os.environ.items() if name not in ENVIRONMENT}
+    command = [sys.executable, "-B", "-c", program]
+    done = subprocess.run(command, env={**kept, **environment}, input=data, capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr.decode()
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def a_file(tmp_path):
+    """Where a folder should be: nothing can be made below it, not even by root."""
+    file = tmp_path / "a_file"
+    file.touch()
+    return str(file)
+
+
+def test_a_second_process_compiles_nothing_again(tmp_path):
+    first, second = (run(ASK_THE_MAP, STEREOVOX_CACHE=str(tmp_path), HOME=str(tmp_path)) for _ in range(2))
+    assert first["log_odds"] == second["log_odds"] == [2, -1, 0]
+    assert (first["hits"], first["misses"]) == (0, 2)
+    assert (second["hits"], second["misses"]) == (2, 0)
+    assert Path(first["folder"]).is_relative_to(tmp_path)
+
+
+def test_kernels_run_where_home_cannot_be_written(tmp_path, a_file):
+    answer = run(ASK_THE_MAP, HOME=a_file, XDG_CACHE_HOME=a_file, TMPDIR=str(tmp_path))
+    assert answer["log_odds"] == [2, -1, 0]
+    assert Path(answer["folder"]).is_relative_to(tmp_path)
+
+
+def test_kernels_run_where_nothing_can_be_written(monkeypatch):
+    monkeypatch.setattr(_jit, "_writable", lambda folder: False)
+    assert fresh_cache_folder() is None
+    monkeypatch.setattr(_jit, "cache_folder", fresh_cache_folder)
+    double = _jit.kernel(lambda x: 2 * x)
+    assert double(4) == 8
+    assert double.stats.cache_path is None
+
+
+def test_the_cache_is_looked_for_in_this_order(monkeypatch, tmp_path, a_file):
+    def found():
+        return fresh_cache_folder().relative_to(tmp_path).parts[0]
+
+    for name, folder in zip(ENVIRONMENT, ("own", "xdg", "home"), strict=True):
+        monkeypatch.setenv(name, str(tmp_path / folder))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    assert found() == "own"
+    monkeypatch.setenv("STEREOVOX_CACHE", a_file)
+    assert found() == "xdg"
+    monkeypatch.delenv("STEREOVOX_CACHE")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert found() == "home"
+    monkeypatch.setattr(Path, "home", _no_home)
+    assert found() == "temporary"
+
+
+def _no_home():
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize("function", [lambda x: x, "no function"])
+def test_numbas_own_setting_is_left_as_it_was(monkeypatch, function):
+    monkeypatch.setattr(numba.core.config, "CACHE_DIR", "theirs")
+    try:
+        _jit.kernel(function)
+    except Exception:
+        assert function == "no function"
+    assert numba.core.config.CACHE_DIR == "theirs"
+
+
+@pytest.fixture
+def copied_package(tmp_path):
+    copy = tmp_path / "package" / "stereovox"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
+
+
+def test_only_kernel_files_change_the_hash(monkeypatch, copied_package):
+    here = _jit._source_hash()
+    monkeypatch.setattr(_jit, "__file__", str(copied_package / "kernels/_jit.py"))
+    assert _jit._source_hash() == here
+    for file, renews in (("mapper.py", False), ("integrate/_cells.py", True), ("maps/cells/_pool.py", True)):
+        before = _jit._source_hash()
+        with (copied_package / file).open("a") as opened:
+            opened.write("# a change\n")
+        assert (_jit._source_hash() != before) == renews, file
+
+
+def test_a_change_in_a_called_file_reaches_the_cached_caller(tmp_path, copied_package):
+    cells = copied_package / "_probe_cells.py"
+    cells.write_text("from stereovox.kernels._jit import cell\n\n\n@cell\ndef g(x):\n    return x + 1\n")
+    caller = "from stereovox.kernels._jit import kernel\nfrom stereovox._probe_cells import g\n\n\n"
+    (copied_package / "_probe.py").write_text(f"{caller}@kernel\ndef f(x):\n    return 10 * g(x)\n")
+    where = {"PYTHONPATH": str(copied_package.parent), "STEREOVOX_CACHE": str(tmp_path / "cache")}
+    assert run(ASK_THE_PROBE, **where) == 20
+    cells.write_text(cells.read_text().replace("x + 1", "x + 2"))
+    assert run(ASK_THE_PROBE, **where) == 30
+
+
+def test_kernels_see_nan_and_infinity():
+    """Full fast-math promises the compiler that there are none, and it then drops these tests."""
+
+    @_jit.kernel
+    def kinds(values, out):
+        for i in range(values.size):
+            out[i] = 1 if values[i] != values[i] else (2 if values[i] == np.float32(np.inf) else 0)
+
+    out = np.zeros(4, np.int32)
+    kinds(np.array([np.nan, np.inf, -np.inf, 1], np.float32), out)
+    assert out.tolist() == [1, 2, 0, 0]
+
+
+def test_a_division_by_zero_in_a_kernel_is_no_error():
+    divide = _jit.kernel(lambda a, b: a / b)
+    assert divide(np.float32(1), np.float32(0)) == np.inf
+
+
+def assembly(kernel):
+    return "\n".join(kernel.inspect_asm().values())
+
+
+PRIVATE = {
+    "numba.core.config": ("CACHE_DIR",),
+    "numba.core.compiler": ("CompilerBase.define_pipelines", "DefaultPassBuilder.define_nopython_pipeline"),
+    "numba.core.compiler_machinery": ("register_pass", "PassManager.finalize"),
+    "numba.core.lowering": ("Lower.setup_function",),
+    "numba.core.typed_passes": ("NativeLowering.lowering_class",),
+    "numba.core.compiler:Flags": ("noalias", "nrt", "forceinline", "no_cpython_wrapper", "no_cfunc_wrapper"),
+}
+"""What `kernels/_jit.py` takes from inside of numba, which may change in any version of it."""
+
+
+def missing_names(private):
+    """Those of `private` that this numba does not have, in full."""
+    for place, names in private.items():
+        module, _, holder = place.partition(":")
+        found = importlib.import_module(module)
+        for name in names:
+            try:
+                attrgetter(f"{holder}.{name}" if holder else name)(found)
+            except AttributeError:
+                yield f"{place}.{name}".replace(":", ".")
+
+
+def test_this_numba_has_all_that_is_private_in_it_and_taken():
+    missing = [*missing_names(PRIVATE)]
+    assert not missing, (
+        f"numba {numba.__version__} has no {', '.join(missing)} any more; change kernels/_jit.py, "
+        "or pin numba in pyproject.toml to the last version that has it"
+    )
+
+
+def test_a_name_that_is_gone_is_named():
+    gone = {"numba.core.lowering": ("Lower.lower", "Lower.prepare"), "numba.core.compiler:Flags": ("no_such_flag",)}
+    assert [*missing_names(gone)] == ["numba.core.lowering.Lower.prepare", "numba.core.compiler.Flags.no_such_flag"]
+
+
+def test_promises_and_wide_vectors_reach_the_compiler(monkeypatch):
+    """A numba that goes another way through its pipeline could leave them out without a word; code would be slower."""
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)
+
+    @_jit.kernel
+    def double(numbers, out):
+        for i in range(numbers.size):
+            out[i] = numbers[i] + numbers[i]
+
+    double(np.ones(4, np.float32), np.zeros(4, np.float32))
+    [code] = double.inspect_llvm().values()
+    lost = f"with numba {numba.__version__} kernels/_jit.py has lost"
+    assert re.search(r"\bnoalias\b[^,]*%arg\.out\.4", code), (
+        f"{lost} the promise that arrays do not overlap (flags.noalias)"
+    )
+    assert '"prefer-vector-width"="512"' in code, f"{lost} the width of vectors (Lower.setup_function, NativeLowering)"
+
+
+def test_the_numba_installed_is_one_that_was_tried():
+    project = tomllib.loads((PACKAGE.parents[1] / "pyproject.toml").read_text())["project"]
+    [pin] = [Requirement(line) for line in project["dependencies"] if line.startswith("numba")]
+    assert numba.__version__ in pin.specifier
+    assert "999" not in pin.specifier, "any numba to come is allowed, though kernels/_jit.py rests on its inside"
+
+
+def needs(*features):
+    missing = [name for name in features if not host_features().get(name)]
+    return pytest.mark.skipif(bool(missing), reason=f"this processor has no {', '.join(missing)}")
+
+
+@needs("avx512f")
+@pytest.mark.skipif("NUMBA_CPU_NAME" in os.environ, reason="compiles for another processor")
+def test_rows_of_numbers_use_the_widest_vectors(monkeypatch):
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)  # of machine code from the cache the assembly is not known
+
+    @_jit.kernel
+    def double(numbers, out):
+        for i in range(numbers.size):
+            out[i] = numbers[i] + numbers[i]
+
+    numbers, out = np.arange(100, dtype=np.float32), np.zeros(100, np.float32)
+    double(numbers, out)
+    assert (out == 2 * numbers).all()
+    assert "zmm" in assembly(double)
+
+
+def test_kernels_for_any_processor_compute_in_float32_and_make_the_same_map(tmp_path):
+    """An int32 times a float32 is a float64 in numba: easily written, never seen, and twice as slow."""
+    frame, mapper = next(iter(sv.open_source("sim:room", "0:1"))), sv.Mapper(voxel_size=0.1)
+    mapper.add(frame)
+    target = HASWELL if all(host_features().get(name) for name in ("avx2", "fma", "bmi2")) else {}
+    path = os.pathsep.join(filter(None, sys.path))
+    made = run(MAP_A_FRAME, pickle.dumps(frame), STEREOVOX_CACHE=str(tmp_path), PYTHONPATH=path, **target)
+    assert {"scatter", "weigh", "survey", "evaluate", "classify"} <= made["assembly"].keys() == made["wide"].keys()
+    for listed in (made["assembly"], made["wide"]):
+        for name, text in listed.items():
+            assert "\tret" in text, name
+            doubles = set(ARITHMETIC.findall(text))
+            assert not doubles, (name, doubles)
+    assert not any("zmm" in text for text in made["assembly"].values()) or not target
+    assert any("zmm" in text for text in made["wide"].values())
+    (indices, log_odds), (their_indices, theirs) = mapper.map.cells(), made["cells"]
+    assert (indices == their_indices).all()
+    assert np.abs(log_odds - theirs).max() <= 0.05
+    assert (log_odds != theirs).mean() <= 1e-3  # where a sum is rounded is the compiler's choice: docs/integrators.md
+
+
+@pytest.mark.parametrize(
+    "line", ["vfmadd213pd", "vcvtps2pd", "vcvtpd2ps", "vcvttpd2dqy", "vcmpltpd", "mulpd", "vrndscalepd"]
+)
+def test_arithmetic_on_doubles_is_known(line):
+    assert ARITHMETIC.findall(f"\t{line}\t%ymm1, %ymm2, %ymm3\n") == [line]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["vpermpd", "vunpcklpd", "vmovupd", "vbroadcastpd", "vshufpd", "vblendvpd", "vandpd", "vgatherqpd", "vmulps"],
+)
+def test_instructions_that_move_doubles_are_no_arithmetic(line):
+    assert not ARITHMETIC.findall(f"\t{line}\t%ymm1, %ymm2, %ymm3\n")
+
+
+def test_a_kernel_that_falls_into_doubles_is_found(monkeypatch):
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)
+
+    @_jit.kernel
+    def half(numbers, out):
+        for i in range(numbers.size):
+            out[i] = 0.1 * numbers[i]
+
+    half(np.ones(100, np.float32), np.zeros(100, np.float32))
+    assert ARITHMETIC.search(assembly(half)) or not host_features().get("avx")
+
+
+def test_kernels_make_no_arrays():
+    @_jit.kernel
+    def make(n):
+        return np.empty(n).size
+
+    with pytest.raises(numba.TypingError):
+        make(3)

@@ -129,7 +129,7 @@ def _outputs() -> str:
 
 
 def _commands() -> str:
-    modules = {name: cli._module(name) for name in cli.COMMANDS}
+    modules = {name: cli.command_module(name) for name in cli.commands()}
     overview = [f"| [`{name}`](#{name}) | {_cell(_first(module.__doc__))} |" for name, module in modules.items()]
     parts = [COMMANDS.format(source=SOURCE.format("src/stereovox/cli"), overview="\n".join(overview))]
     for name, module in modules.items():

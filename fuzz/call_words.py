@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from stereovox.cli import COMMANDS, _module
+from stereovox.cli import command_module, commands
 
 Draw = Callable[[str], str]
 WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "export": 3}
@@ -82,7 +82,8 @@ SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".
 
 def call(draw: Draw, dice: random.Random) -> list[str]:
     """Return the words of one call."""
-    command = dice.choices(COMMANDS, [WEIGHTS.get(name, 1) for name in COMMANDS])[0]
+    names = list(commands())
+    command = dice.choices(names, [WEIGHTS.get(name, 1) for name in names])[0]
     if dice.random() < 0.02:
         return dice.choice(([], ["--json"], ["--version"], [command], [command, "--help"], ["mpa", draw("")]))
     parser = _parser(command)
@@ -105,7 +106,7 @@ def call(draw: Draw, dice: random.Random) -> list[str]:
 @cache
 def _parser(command: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=command, add_help=False)
-    _module(command).add_arguments(parser)
+    command_module(command).add_arguments(parser)
     parser.add_argument("--json", action="store_true")
     return parser
 

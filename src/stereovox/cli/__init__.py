@@ -13,14 +13,14 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from itertools import pairwise
-from keyword import iskeyword
 from typing import Any, NoReturn
 
 import stereovox
 from stereovox.errors import StereovoxError, did_you_mean, one_line, printed
+from stereovox.registry import entry_points
 
 GROUPS = {
     "Start": ("start", ("demo", "info", "simulate")),
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _check_command(words)
         arguments = _parse(words)
-        result = _module(arguments.command).run(arguments)
+        result = command_module(arguments.command).run(arguments)
         failed = _print_json(result) if arguments.json else 0
         return failed or (2 if result.get("not_written") else DOUBTED if result.get("doubts") else 0)
     except StereovoxError as error:
@@ -125,34 +125,51 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
-    parser = _Parser(prog="stereovox", description=stereovox.__doc__)
+    parser = _Parser(prog="stereovox", description=stereovox.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for name in words[:1] if words and words[0] in COMMANDS else COMMANDS:  # the others' modules take long to import
-        module = _module(name)
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    alone = words[:1] if words and not words[0].startswith("-") else []  # the modules of all take long to import
+    chosen = alone or commands()
+    modules = {name: command_module(name) for name in chosen}
+    for name, module in modules.items():
         about = str(module.__doc__).strip()
-        command = commands.add_parser(
-            name, help=about.splitlines()[0], description=about, epilog=f"example: {module.EXAMPLE}"
-        )
+        command = subparsers.add_parser(name, description=about, epilog=f"example: {module.EXAMPLE}")
         module.add_arguments(command)
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line of stdout")
+    subparsers.help = _grouped(modules)
     arguments, left = parser.parse_known_args(words)
     if left:
-        commands.choices[arguments.command].refuse(left[0])
+        subparsers.choices[arguments.command].refuse(left[0])
     return arguments
+
+
+def _grouped(modules: Mapping[str, Any]) -> str:
+    """Return the first line of each command's description, under the name of its group."""
+    groups: dict[str, list[str]] = {group: [] for group in GROUPS}
+    for name, module in modules.items():
+        group = next((group for group, (_, names) in GROUPS.items() if name in names), getattr(module, "GROUP", "More"))
+        groups.setdefault(group, []).append(f"  {name:10} {str(module.__doc__).strip().splitlines()[0]}")
+    return "\n".join(line for group, lines in groups.items() if lines for line in (group, *lines))
+
+
+def commands() -> dict[str, str]:
+    """Return the module of each command by its name: the built-in ones, then those of other packages."""
+    others = {entry.name: entry.value for entry in entry_points(group="stereovox.commands")}
+    return COMMANDS | {name: module for name, module in others.items() if name not in COMMANDS}
 
 
 def _check_command(words: Sequence[str]) -> None:
     """Raise an error that suggests the right command or order of options, which argparse does not."""
     if words and words[0].startswith("-") and words[0] not in GLOBAL_OPTIONS:
-        option, command = words[0].partition("=")[0], next((word for word in words if word in COMMANDS), "COMMAND")
+        option, command = words[0].partition("=")[0], next((word for word in words if word in commands()), "COMMAND")
         raise StereovoxError(f"'{option}' stands before the command; write it after: stereovox {command} ... {option}")
     empty = next((word for word in words if word.startswith("--") and word.endswith("=--")), None)
     if empty is not None:  # argparse takes the value for the end of all options
         raise StereovoxError(f"'{empty}': '--' is no value; give another")
-    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
-        raise StereovoxError(f"unknown command '{words[0]}'{did_you_mean(words[0], COMMANDS)}; see: stereovox --help")
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS and words[0] not in (known := commands()):
+        raise StereovoxError(f"unknown command '{words[0]}'{did_you_mean(words[0], known)}; see: stereovox --help")
 
 
-def _module(name: str) -> Any:
-    return import_module(f"stereovox.cli.{name}{'_' * iskeyword(name)}")
+def command_module(name: str) -> Any:
+    """Return the module of a command."""
+    return import_module(COMMANDS.get(name) or commands()[name])

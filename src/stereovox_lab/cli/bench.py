@@ -19,6 +19,7 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox_lab.bench.rows import Variant
 
+GROUP = "Prove"
 EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
 VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
 FAR = ("both", "unknown", "free")

@@ -14,6 +14,7 @@ from typing import Any
 
 from stereovox.cli.terminal import command_line, progress_of_steps, say, say_about_compiling, say_table
 
+GROUP = "Prove"
 EXAMPLE = "stereovox benchmark recordings/kitchen --libraries stereovox,octomap --out kitchen-benchmark"
 
 

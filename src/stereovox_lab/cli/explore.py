@@ -12,6 +12,7 @@ from typing import Any
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling, say_table
 from stereovox.errors import StereovoxError
 
+GROUP = "Prove"
 EXAMPLE = "stereovox explore sim:room 'sim:hall?plan={seed}' --seeds 0:20 --out missions"
 
 

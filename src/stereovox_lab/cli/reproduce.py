@@ -15,6 +15,7 @@ from typing import Any
 
 from stereovox.cli.terminal import progress_bar, say, say_about_compiling
 
+GROUP = "Prove"
 EXAMPLE = "stereovox reproduce chien2020 --out chien2020"
 
 

@@ -49,7 +49,7 @@ SOURCES = {
     "kitti_stereo2015": "stereovox.sources.kitti.stereo2015:KittiStereo2015",
     "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.simulate.simulation:Simulation",
-    "rtabmap_db": "stereovox.sources.rgbd.layouts.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
+    "rtabmap_db": "stereovox.sources.rgbd.layouts.rtabmap_db:RtabmapDatabase",  # before bags: SQLite files too
     "bag_clouds": "stereovox.sources.clouds.bag:BagClouds",  # before the depth images of the same bag
     "bag": "stereovox.sources.bags.recording:Bag",
     "sens": "stereovox.sources.rgbd.packed:SensFile",

@@ -16,7 +16,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.files.lock import only_writer_in, only_writer_of
-from stereovox.runs import recording as run
+from stereovox.runs import recording
 from stereovox.runs.recording import REST, Checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -244,7 +244,7 @@ def test_the_end_tells_what_was_refused_and_when_frames_were_believed_again(tmp_
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsys, resume):
     assert mapped(tmp_path / "m", "--frames", ":2") == 0
-    monkeypatch.setattr(run.MapRun, "_prepare", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr(recording.MapRun, "_prepare", lambda *_: pytest.fail("worked"))
     refused = []
 
     def second():
@@ -360,7 +360,7 @@ def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.usefixtures("obeys_signals")
 def test_the_first_ctrl_c_waits_for_the_save_that_is_being_made():
-    with run.interrupt_between_steps() as check:
+    with recording.interrupt_between_steps() as check:
         saved = []
         signal.raise_signal(signal.SIGINT)
         Checkpoints(lambda: saved.append(1), "m", 1.0).save(1)

@@ -9,7 +9,7 @@ from made_robot_bags import RobotBagMaker
 
 import stereovox as sv
 from stereovox.cli.correct.loops import say_closure
-from stereovox.correct import close_loops as closing
+from stereovox.correct.close_loops import close
 from stereovox.correct.loops.closer import Loop, LoopCloser
 from stereovox.correct.loops.matching import Match
 from stereovox.correct.loops.positions import Positions
@@ -50,8 +50,8 @@ def mapper(frames):
 @pytest.fixture
 def closure(mapper, monkeypatch):
     """What was done to the map of `mapper`."""
-    monkeypatch.setattr(closing, "LoopCloser", MadeCloser)
-    return closing.close(mapper)
+    monkeypatch.setattr("stereovox.correct.close_loops.LoopCloser", MadeCloser)
+    return close(mapper)
 
 
 def test_places_are_those_of_the_middles_of_submaps(frames, closure):
@@ -92,13 +92,13 @@ def test_other_poses_and_merging_forget_them(mapper, closure):
 
 def test_a_map_without_loops_says_that_none_were_found(mapper):
     assert mapper.map.history.loops is None
-    closure = closing.close(mapper)
+    closure = close(mapper)
     assert not closure.loops
     assert mapper.map.history.loops == LoopLines.between([], closure.ends(closure.refused, closure.T_world_sensor))
 
 
 def test_a_recording_is_mapped_and_closed_and_not_gone_on_with(tmp_path, monkeypatch):
-    monkeypatch.setattr(closing, "LoopCloser", MadeCloser)
+    monkeypatch.setattr("stereovox.correct.close_loops.LoopCloser", MadeCloser)
     out, settings = tmp_path / "room.svox", {"voxel_size": 0.2, "trust.max_disagreement": 1}
     made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, **settings)
     saved = sv.load_map(out)
@@ -139,8 +139,8 @@ def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, ma
             assert mapper.add(later).refused is None
             super().finish(progress, positions)
 
-    monkeypatch.setattr(closing, "LoopCloser", Meanwhile)
-    closing.close(mapper)
+    monkeypatch.setattr("stereovox.correct.close_loops.LoopCloser", Meanwhile)
+    close(mapper)
     last = mapper.map.kept_frames.frames[-1]
     assert (len(mapper.map.kept_frames) <= before) == (budget is not None)
     assert last.stamp_ns == later.stamp_ns
@@ -151,7 +151,7 @@ def test_too_few_positions_are_told_before_any_work(mapper, monkeypatch):
     monkeypatch.delattr(LoopCloser, "add")
     stamps_ns = np.array([frame.stamp_ns for frame in mapper.map.kept_frames.frames[:2]])
     with pytest.raises(sv.StereovoxError, match="2 places of the way have a position"):
-        closing.close(mapper, positions=Positions(stamps_ns, np.zeros((2, 3)), 1.0))
+        close(mapper, positions=Positions(stamps_ns, np.zeros((2, 3)), 1.0))
 
 
 def test_what_the_closed_map_is_made_of_is_said(closure, capsys):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Good inputs of each kind, and for each check of `stereovox.mapping.entrance` a bad one that must be refused for it."""
+"""Good inputs of each kind, and for each check of `mapping.entrance` a bad one that must be refused for it."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ import json, os, sys
 import machine_code
 job = json.loads(sys.argv[1])
 machine_code.record(job["runs"])
-from stereovox import _jit
+from stereovox.kernels import _jit
 _jit.cache_folder = lambda: None  # what comes from the disk cache is optimised already
 exec(job["program"])
 processors = [machine_code.Processor(*p) for p in job["processors"]]

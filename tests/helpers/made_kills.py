@@ -22,7 +22,7 @@ from stereovox.localize.track import Track
 from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.mapping import Mapping
-from stereovox.runs import recording as run
+from stereovox.runs import recording
 from stereovox.runs.recording import Checkpoints
 from stereovox.sources.poses.trajectory import Trajectory
 
@@ -187,5 +187,5 @@ def kill_at_steps(kind, folder, kills):
 
 
 if __name__ == "__main__":
-    run.REST = 0
+    recording.REST = 0
     print(kill_at_steps(KINDS[sys.argv[1]], Path(sys.argv[2]), int(sys.argv[3])))

@@ -23,7 +23,7 @@ from packaging.requirements import Requirement
 import stereovox as sv
 from stereovox.kernels import _jit
 
-PACKAGE = Path(_jit.__file__).parent
+PACKAGE = Path(sv.__file__).parent
 fresh_cache_folder = _jit.cache_folder.__wrapped__
 ENVIRONMENT = ("STEREOVOX_CACHE", "XDG_CACHE_HOME", "HOME")
 ASK_THE_MAP = """
@@ -31,7 +31,8 @@ import json
 import numpy as np
 from stereovox import VoxelMap, load_config
 from stereovox.kernels._jit import cache_folder
-from stereovox.maps import _pool, _query
+from stereovox.maps.cells import _pool
+from stereovox.maps.query import _query
 
 voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[0, 0, 0], [9, -9, 3]], [2.0, -1.0])
 stats = [kernel.stats for kernel in (_pool.put, _query.look_up)]
@@ -49,7 +50,7 @@ machine_code.record()
 import stereovox as sv
 from stereovox.depth import _images as depth
 from stereovox.integrate import _hits, _projective, _windows
-from stereovox.maps import _pool as maps
+from stereovox.maps.cells import _pool as maps
 
 mapper = sv.Mapper(voxel_size=0.1)
 mapper.add(pickle.load(sys.stdin.buffer))

@@ -7,7 +7,7 @@ from machine_code import CORTEX_A72, HASWELL, SAPPHIRE_RAPIDS, ZEN_3, Arithmetic
 TWO_KERNELS = """
 import numba
 import machine_code
-from stereovox import _jit
+from stereovox.kernels import _jit
 
 @_jit.kernel
 def shares(parts, wholes, out):

@@ -1,4 +1,4 @@
-"""Each check of `stereovox.mapping.entrance` refuses a bad input of each kind, and does so by the function in the table."""
+"""Each check of `mapping.entrance` refuses a bad input of each kind, and does so by the function in the table."""
 
 import ast
 import inspect
@@ -124,12 +124,12 @@ MAKERS = {
     "validate_scan", "validate_upright_scan", "check_unit_of_rays", "Mapper", "GridMapper",
 }  # fmt: skip
 """What is called by whoever turns measurements into evidence, or into a map."""
-INSIDE = ("depth/", "integrate/", "trust/")
+INSIDE = ("depth/", "integrate/", "frame/")
 """Rooms of what the entrance calls."""
 DOORS = {
     "mapper.py": "the entrance",
     "mapping/deadline.py": "the entrance: prepares frames for `Mapper.add`",
-    "run.py": "recordings of depth images, pairs and clouds, also those that run now: Mapper.add",
+    "runs/recording.py": "recordings of depth images, pairs and clouds, also those that run now: Mapper.add",
     "runs/floor.py": "recordings of robots: GridMapper.add",
     "ros/mapping.py": "ROS 2: Mapper.add and GridMapper.add",
     "correct/remap.py": "a recording again, from corrected poses: Mapper.correct, of frames that were taken",
@@ -149,7 +149,6 @@ DOORS = {
     "live/outputs.py": "the sphere of a live run: DepthPipeline.checked, of images that a mapper took",
     "evaluate/lidar_truth.py": "truth of a recording's lidar: its unit; it makes no map to move by",
     "calibrate/pair.py": "registers images with each other; makes no map",
-    "lab": "benchmarks and papers, of scenes and recordings that they name",
 }
 """All places that make evidence or a map of measurements, and how their input is checked."""
 
@@ -162,11 +161,7 @@ def sources():
 def doors():
     call = re.compile(rf"(?<!def )(?<!class )(?<!`)\b(?:{'|'.join(sorted(MAKERS))})\(")
     found = {name for name, text in sources().items() if call.search(text)}
-    return {
-        name.split("/")[0] if name.startswith("lab/") else name
-        for name in found
-        if not name.startswith(INSIDE) or name in DOORS
-    }
+    return {name for name in found if not name.startswith(INSIDE) or name in DOORS}
 
 
 def test_no_door_is_beside_the_entrance():

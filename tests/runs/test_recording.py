@@ -16,7 +16,7 @@ from stereovox.cli import options
 from stereovox.errors import SourceError
 from stereovox.mapping import deadline
 from stereovox.opening import open_stream
-from stereovox.runs import recording as run
+from stereovox.runs import recording
 
 SOURCE = "sim:room?image_width=160"
 SETTINGS = {"voxel_size": 0.1, "frames": ":12"}
@@ -65,7 +65,7 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert result.out == tmp_path / "a.svox"
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
-    assert options.CHECKPOINT_S == run.CHECKPOINT_S
+    assert options.CHECKPOINT_S == recording.CHECKPOINT_S
 
 
 class Breaking:
@@ -227,7 +227,7 @@ def test_a_run_says_which_map_it_replaces(tmp_path):
     sv.map_recording(SOURCE, out, voxel_size=0.1, frames=":4", resume=True, notify=notes.append)
     assert sum("replaces" in note for note in notes) == 1
     (out / "manifest.json").write_text("{")
-    assert run.replaces(out) == f"note: {out} replaces a damaged map that is there"
+    assert recording.replaces(out) == f"note: {out} replaces a damaged map that is there"
 
 
 def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
@@ -258,7 +258,7 @@ def test_a_map_made_level_with_a_profile(tmp_path):
 
 @pytest.mark.usefixtures("obeys_signals")
 def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monkeypatch):
-    set_handler, usual = signal.signal, [signal.getsignal(number) for number in run._default_signals()]
+    set_handler, usual = signal.signal, [signal.getsignal(number) for number in recording._default_signals()]
 
     def prompt(number, handler):
         before = set_handler(number, handler)
@@ -267,7 +267,7 @@ def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monk
         return before
 
     monkeypatch.setattr(signal, "signal", prompt)
-    with pytest.raises(KeyboardInterrupt), run.ended_in_order():
+    with pytest.raises(KeyboardInterrupt), recording.ended_in_order():
         pytest.fail("the signal came before")
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == usual
 
@@ -275,4 +275,4 @@ def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monk
 @pytest.mark.usefixtures("obeys_signals")
 def test_signals_are_left_to_the_main_thread():
     with ThreadPoolExecutor(1) as other:
-        assert other.submit(run._default_signals).result() == []
+        assert other.submit(recording._default_signals).result() == []

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that run on a graphics card, and the cells they share with those for the processor.
 
-The body of a `@cell` of `kernels/_jit.py` is plain Python: `on_gpu` compiles it for the card, with all cells that it calls. So
+The body of a `@cell` of `_jit.py` is plain Python: `on_gpu` compiles it for the card, with all cells that it calls. So
 no formula is written twice. Only files that are imported when a card is asked for import this one.
 
 Launches have the same size whatever there is to do; each kernel loops over its work in strides of the whole grid. So

@@ -24,7 +24,7 @@ from numba.core.typed_passes import NativeLowering
 
 # Two things that make kernels fast cannot be had through numba's public options: the promise that arrays do not
 # overlap, and vectors of 512 bits. Both need its private pipeline (numba.core), which any version may change without a
-# word. So pyproject.toml allows just the versions this was tried with; tests/kernels/test_jit.py names what a new one breaks.
+# word. So pyproject.toml allows just the versions this was tried with; tests/kernels/test_jit.py names what one breaks.
 
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""

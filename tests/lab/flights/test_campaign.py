@@ -6,15 +6,16 @@ import pytest
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
+from stereovox_lab import Cruise, explore
 from stereovox_lab.flights.campaign import summary
 
-SHORT = sv.Cruise(seconds=12.0, camera_hz=5.0)
+SHORT = Cruise(seconds=12.0, camera_hz=5.0)
 
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
     folder, steps = tmp_path_factory.mktemp("maps") / "new", []
-    result = sv.explore(["sim:hall?plan={seed}"], seeds=[4, 5], cruise=SHORT, maps=folder,
+    result = explore(["sim:hall?plan={seed}"], seeds=[4, 5], cruise=SHORT, maps=folder,
                         progress=lambda *step: steps.append(step))  # fmt: skip
     return result, folder, steps
 
@@ -44,8 +45,8 @@ def test_the_first_map_is_kept(told):
 
 
 def test_processes_change_nothing():
-    scenes, cruise = ["sim:hall?plan={seed}"], sv.Cruise(seconds=1.5, camera_hz=4.0)
-    one, two = (sv.explore(scenes, seeds=[4, 5], cruise=cruise, jobs=jobs) for jobs in (1, 2))
+    scenes, cruise = ["sim:hall?plan={seed}"], Cruise(seconds=1.5, camera_hz=4.0)
+    one, two = (explore(scenes, seeds=[4, 5], cruise=cruise, jobs=jobs) for jobs in (1, 2))
     assert one == two
     assert one["flights"][0]["coverage"][-1][1] > 0
 
@@ -80,11 +81,11 @@ def test_summaries_count_their_own_scene_and_its_collisions():
         ({"scenes": ["sim:nowhere"]}, "unknown scene .nowhere"),
         ({"scenes": ["sim:hall?plan={number}"]}, "only {seed}"),
         ({"scenes": ["sim:room?axes=optical"]}, "z is not up"),
-        ({"cruise": sv.Cruise(speed=0)}, "speed 0"),
-        ({"cruise": sv.Cruise(voxel_size=float("nan"))}, "voxel_size nan"),
-        ({"cruise": sv.Cruise(margin=-0.1)}, "margin -0.1"),
+        ({"cruise": Cruise(speed=0)}, "speed 0"),
+        ({"cruise": Cruise(voxel_size=float("nan"))}, "voxel_size nan"),
+        ({"cruise": Cruise(margin=-0.1)}, "margin -0.1"),
     ],
 )
 def test_mistakes_are_one_line(given, complaint):
     with pytest.raises(StereovoxError, match=complaint):
-        sv.explore(**given)
+        explore(**given)

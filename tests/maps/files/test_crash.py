@@ -28,7 +28,7 @@ from stereovox.maps.occupancy import OccupancyGrid
 HOLDER = """
 import sys
 from pathlib import Path
-from stereovox.maps import lock
+from stereovox.maps.files import lock
 with getattr(lock, sys.argv[1])(Path(sys.argv[2])):
     print("held", flush=True)
     sys.stdin.readline()

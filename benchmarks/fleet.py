@@ -81,7 +81,7 @@ def one_map(recordings: Sequence[str], settings: dict[str, Any]) -> tuple[np.nda
         for frame in mapper.map.kept_frames.frames:
             image = levels(frame.quality).prepare(frame.frame()).image
             storage.history.frames = count
-            storage.look_from(image.viewpoint)
+            storage.set_viewpoint(image.viewpoint)
             storage.add(levels(frame.quality).integrator.evidence(image))
             count += 1
     return *storage.blocks(), count

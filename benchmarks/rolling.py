@@ -57,7 +57,7 @@ def shift_ms(outside: str) -> float:
         T[0, 3] = 0.2 * i + 1.0
         view = Viewpoint(camera, T, i)
         start = perf_counter()
-        rolling.storage.look_from(view)
+        rolling.storage.set_viewpoint(view)
         times.append(1e3 * (perf_counter() - start))
         rolling.add(full)
     rolling.close()

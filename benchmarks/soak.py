@@ -124,7 +124,7 @@ def fly(mapper: sv.Mapper, loop: Loop, count: int) -> dict:
         if report.refused:
             refused[report.refused] += 1
         else:
-            ways[report.way] += 1
+            ways[report.quality] += 1
         if (i + 1) % MINUTE == 0 or i + 1 == count:
             part = slice(i // MINUTE * MINUTE, i + 1)
             minutes.append(

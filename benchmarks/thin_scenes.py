@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox import Frame, PinholeCamera
 from stereovox.frame import Reason
-from stereovox.simulate.honest import HonestCamera
+from stereovox.simulate.honest import RealisticDepthCamera
 
 HZ = 30
 HFOV_DEG, BASELINE, SUBPIXEL = 91.2, 0.05, 0.08
@@ -172,7 +172,7 @@ def measured(
     """
     depth = true_depth(scene, T)
     if scene.noise == HONEST:
-        millimetres, reason = HonestCamera(scene.camera, nearest=scene.nearest).measure(depth, seed, T)
+        millimetres, reason = RealisticDepthCamera(scene.camera, nearest=scene.nearest).measure(depth, seed, T)
         return millimetres.astype(np.float32) / 1000, reason
     if scene.noise == "flying":
         depth = flying(scene, T, depth, random)

@@ -77,7 +77,7 @@ for seen in [*(scans(frames) if grid else frames), *others]:
     cameras.add(camera)
     later |= compiled() - allowed
 assert doubted or "deadline_ms" in settings
-print(json.dumps({"ways": dict(mapper.map.history.ways), "cameras": len(cameras), "later": sorted(later)}))
+print(json.dumps({"ways": dict(mapper.map.history.quality), "cameras": len(cameras), "later": sorted(later)}))
 if hasattr(mapper.map, "close"):
     mapper.map.close()
 """
@@ -105,7 +105,7 @@ def test_nothing_is_compiled_after_the_first_frame_of_a_camera(source, settings)
     assert told["cameras"] == (4 if source.startswith("sim:surround") else 1)
     assert told["later"] == []
     if "deadline_ms" in settings:
-        assert set(told["ways"]) == {"full", "near", "coarse"}, "or no other way was taken"
+        assert set(told["quality"]) == {"full", "near", "coarse"}, "or no other way was taken"
 
 
 @pytest.fixture

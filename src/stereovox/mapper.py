@@ -24,7 +24,7 @@ from stereovox.kernels.device import check_on_processor, on_usable_device
 from stereovox.kernels.threads import MapLock, uninterrupted
 from stereovox.mapping.comparison import Comparison
 from stereovox.mapping.deadline import Deadline, Levels
-from stereovox.mapping.gate import Passed
+from stereovox.mapping.gate import GateResult
 from stereovox.mapping.intake import Aged, Intake
 from stereovox.mapping.rebuild import CorrectionReport, FramePoses, correct
 from stereovox.maps import VoxelMap, make_map
@@ -163,11 +163,11 @@ class Mapper(Aged):
             packed = self._packed(depth_frame, passed)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
-                self.map.storage.look_from(image.viewpoint)
+                self.map.storage.set_viewpoint(image.viewpoint)
                 cells = self.map.add(evidence)
                 self._keep(depth_frame, packed, passed, quality.name, evidence)
                 offer.accept(passed, quality.name)
-                self.map.history.ways[quality.name] += 1
+                self.map.history.quality[quality.name] += 1
                 self.map.history.path.walk(passed.sensor, passed.seen)
             map_ms = 1e3 * (perf_counter() - prepared)
             offer.report = UpdateReport(
@@ -236,7 +236,7 @@ class Mapper(Aged):
         """Release what the map holds outside memory: nothing, unless it keeps tiles on disk."""
         self.map.close()
 
-    def _packed(self, frame: Frame | Cloud, passed: Passed) -> Packed | PackedCloud | None:
+    def _packed(self, frame: Frame | Cloud, passed: GateResult) -> Packed | PackedCloud | None:
         """Return the frame's depth image or cloud to be kept; None where it is not."""
         kept = self.map.storage.kept
         return packed_of(frame) if kept is not None and kept.wants(passed.sensor, passed.seen) else None
@@ -245,7 +245,7 @@ class Mapper(Aged):
         self,
         frame: Frame | Cloud,
         packed: Packed | PackedCloud | None,
-        passed: Passed,
+        passed: GateResult,
         quality: str,
         evidence: Evidence,
     ) -> None:

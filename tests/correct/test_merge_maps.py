@@ -65,7 +65,7 @@ def test_frames_that_are_in_both_maps_count_once():
     a, b = mapped(every[:9]), mapped(every[5:])
     both, one = sv.merge(a, b), mapped(every)
     assert equal(both, one)
-    assert both.frames == len(both.kept_frames) == sum(both.history.ways.values()) == len(every)
+    assert both.frames == len(both.kept_frames) == sum(both.history.quality.values()) == len(every)
     shifted = [replace(frame, T_world_sensor=frame.T_world_sensor + np.eye(4, k=3)) for frame in every[:3]]
     assert equal(sv.merge(a, mapped(shifted)), a)
 

@@ -10,7 +10,7 @@ from made_depth import camera_text, matrix_line, posed, render, units, write
 import stereovox as sv
 from stereovox.cli import main
 from stereovox.descriptions.description import many, metres
-from stereovox.runs.survey import Up
+from stereovox.runs.survey import UpEstimate
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_one_thing_is_no_plural():
 
 @pytest.mark.parametrize(("off_deg", "words"), [(1.0, "up is -y"), (27.4, "up is 27 degrees from -y")])
 def test_up_in_words(off_deg, words):
-    assert Up("-y", np.array([0, -1.0, 0]), np.radians(off_deg), True, "").words == words
+    assert UpEstimate("-y", np.array([0, -1.0, 0]), np.radians(off_deg), True, "").words == words
 
 
 def test_a_recording_names_map_then_picture():

@@ -9,7 +9,7 @@ import pytest
 from made_floors import FREE, WALL, changed, random_floor, room
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import lay
+from stereovox.evaluate.grids.grid_lattice import aligned_grids
 from stereovox.evaluate.grids.grid_scores import Difference, differences, score_grids, wrong
 from stereovox.geometry import se2
 from stereovox.maps import State
@@ -104,7 +104,7 @@ def test_equation_7_by_hand():
     reference = OccupancyGrid(np.array([[100, 0, 0, -1], [100, 0, -1, 100]], np.int8), 1.0)
     ours = OccupancyGrid(np.array([[0, 0, 100, 0], [100, -1, -1, 50]], np.int8), 1.0)
     found = score_grids(ours, reference, align=False)
-    assert differences(lay(ours, reference)).tolist() == [[3, 0, 2, 4], [0, 1, 0, 1]]
+    assert differences(aligned_grids(ours, reference)).tolist() == [[3, 0, 2, 4], [0, 1, 0, 1]]
     errors = found.errors
     assert (errors.missed, errors.wrongly_occupied, errors.wrongly_free, errors.extra) == (2, 1, 1, 1)
     assert (errors.reference_occupied, errors.reference_free) == (3, 3)
@@ -191,10 +191,10 @@ def test_maps_of_other_frames_and_quarter_turns_lie_on_each_other_exactly(turns)
     corner = [(0, 0, 0), (wide, 0, np.pi / 2), (wide, high, np.pi), (0, high, -np.pi / 2)][turns]
     pose = se2.compose(reference.origin, corner)
     ours = OccupancyGrid(np.ascontiguousarray(np.rot90(reference.cells, turns)), 0.25, tuple(pose))
-    laid = lay(ours, reference)
+    laid = aligned_grids(ours, reference)
     assert (differences(laid) == Difference.SAME).all()
     assert (laid.reference.states == State.OCCUPIED).any()
-    moved = lay(changed(ours, np.roll(ours.cells, 1, axis=0)), reference)
+    moved = aligned_grids(changed(ours, np.roll(ours.cells, 1, axis=0)), reference)
     assert (differences(moved) != Difference.SAME).any()
 
 
@@ -205,7 +205,7 @@ def test_no_obstacle_is_lost_when_cells_become_larger():
         fine[row, column] = WALL
     ours = OccupancyGrid(fine, 0.02)
     coarse = OccupancyGrid(np.full((12, 16), FREE, np.int8), 0.2)
-    laid = lay(ours, coarse)
+    laid = aligned_grids(ours, coarse)
     found = {tuple(map(int, at)) for at in np.argwhere(laid.map.states == State.OCCUPIED)}
     assert found == {(row // 10, column // 10) for row, column in single}
 
@@ -218,7 +218,7 @@ def test_no_obstacle_is_lost_in_a_turn_and_walls_do_not_grow(yaw):
     cells[30] = WALL
     ours = OccupancyGrid(cells, 0.1)
     reference = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1)
-    laid = lay(ours, reference, (0.5, -0.2, yaw))
+    laid = aligned_grids(ours, reference, (0.5, -0.2, yaw))
     walls = np.argwhere(cells == WALL)
     where = laid.map.indices(se2.transform((0.5, -0.2, yaw), ours.centres(*walls.T)))
     near = [laid.map.states[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] for r, c in where]
@@ -231,12 +231,12 @@ def test_no_obstacle_is_lost_in_a_turn_and_walls_do_not_grow(yaw):
 def test_finer_cells_take_the_value_of_the_cell_they_lie_in():
     coarse = random_floor(4, shape=(3, 4), side=0.4)
     fine = OccupancyGrid(np.zeros((12, 16), np.int8), 0.1)
-    assert (lay(coarse, fine).map.cells == np.kron(coarse.cells, np.ones((4, 4), int))).all()
+    assert (aligned_grids(coarse, fine).map.cells == np.kron(coarse.cells, np.ones((4, 4), int))).all()
 
 
 def test_excluded_regions_are_in_the_frame_of_a_turned_map():
     reference = random_floor(1, shape=(20, 30), side=0.1, origin=(1.0, 2.0, 0.5))
-    laid = lay(reference, reference, exclude=[(1.0, 2.5, 2.0, 3.0)])
+    laid = aligned_grids(reference, reference, exclude=[(1.0, 2.5, 2.0, 3.0)])
     rows, columns = np.divmod(np.arange(laid.excluded.size), laid.excluded.shape[1])
     x, y = laid.reference.centres(rows, columns).T
     assert (laid.excluded.ravel() == ((x >= 1) & (x <= 2) & (y >= 2.5) & (y <= 3))).all()
@@ -245,7 +245,7 @@ def test_excluded_regions_are_in_the_frame_of_a_turned_map():
 
 def test_the_difference_image_is_the_number_above():
     theirs, ours = random_floor(1), random_floor(2)
-    laid = lay(ours, theirs, exclude=[REGION])
+    laid = aligned_grids(ours, theirs, exclude=[REGION])
     found = score_grids(ours, theirs, [REGION], align=False)
     number = found.errors.reference_free + found.errors.reference_occupied
     assert 100 * wrong(differences(laid)).sum() / number == pytest.approx(found.eq7_percent)

@@ -179,7 +179,7 @@ def test_cells_are_read_from_a_window_with_tiles_on_disk_as_well(tmp_path):
     for x in (0.0, 60.0):  # far enough for what was near the first place to go to disk
         T = np.eye(4)
         T[0, 3] = x
-        rolling.storage.look_from(Viewpoint(camera, T))
+        rolling.storage.set_viewpoint(Viewpoint(camera, T))
         block = np.array([[int(x / SIZE) >> 3, 0, 0]], np.int32)
         values = random.integers(-900, 900, (1, 512)).astype(np.int16)
         rolling.add(Evidence(block, values, np.empty((0, 3), np.int32), 0))

@@ -60,7 +60,7 @@ def of_all(*recordings, **settings):
     for one in recordings:
         for frame in (alone(one, **settings) if isinstance(one, str) else one).kept_frames.frames:
             image = level.prepare(frame.frame()).image
-            storage.look_from(image.viewpoint)
+            storage.set_viewpoint(image.viewpoint)
             storage.add(level.integrator.evidence(image))
             storage.history.frames += 1
     return storage.blocks()

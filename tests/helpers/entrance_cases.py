@@ -17,7 +17,7 @@ from stereovox.geometry import se2
 from stereovox.geometry.se3 import look_at, rotation_matrix
 from stereovox.mapper import GridMapper
 from stereovox.mapping.entrance import CLOUD, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, SCAN
-from stereovox.maps.record.history import Doubt
+from stereovox.maps.record.history import DisagreementSpell
 
 CAMERA = sv.PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.1)
 WALL_M = 1.0
@@ -272,7 +272,7 @@ def _doubted(fits: int) -> Callable[[str], list[Case]]:
 
     def judged(mapper: Any) -> None:
         sensor = next(iter(mapper.map.history.trusted))
-        mapper.map.history.doubts[sensor] = Doubt(-8 * 10**8, 11 * 10**8, 60, fits)
+        mapper.map.history.doubts[sensor] = DisagreementSpell(-8 * 10**8, 11 * 10**8, 60, fits)
 
     return lambda kind: [replace(case, arrange=judged) for case in _contradicting(kind)]
 

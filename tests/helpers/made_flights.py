@@ -49,7 +49,7 @@ def flight(seed, frames, step_m=0.4, step_s=0.3, blocks=16):
 def fly(one, moments):
     for viewpoint, evidence in moments:
         one.storage.check_room(evidence)
-        one.storage.look_from(viewpoint)
+        one.storage.set_viewpoint(viewpoint)
         one.add(evidence)
         one.frames += 1
     return one

@@ -12,7 +12,7 @@ from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.mapping.disagreement import LOOKS, MAX_LIMIT, SPREADS, USUAL_AT_FIRST, DisagreementMonitor, Sight
 from stereovox.maps.record.glance import SIDE, Glance, Votes
-from stereovox.maps.record.history import MAX_SENSORS, Doubt, History, RunningMean, Seen
+from stereovox.maps.record.history import MAX_SENSORS, DisagreementSpell, History, RunningMean, StampedPose
 
 FRAME = sv.Frame(np.ones((2, 2), np.float32), sv.PinholeCamera(2, 2, 1, 1, 0.5, 0.5), np.eye(4))
 GLANCE = Glance.at(np.array([[0.5, 0.2, 2.0]]), np.eye(4))
@@ -155,15 +155,15 @@ def test_how_long_is_a_setting():
 def test_a_frame_that_comes_late_may_disagree_more():
     told = Told()
     told(*[0.03] * 40)
-    told.history.trusted["camera"] = Seen(told.now, (0.0,) * 12)
+    told.history.trusted["camera"] = StampedPose(told.now, (0.0,) * 12)
     early, late = (
         DisagreementMonitor(told.config, told.history).limit("camera", told.now + ms * 1_000_000) for ms in (200, 1200)
     )
     assert late - 0.03 == pytest.approx(2 * (early - 0.03), rel=1e-2)
     assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 10**12) == late
-    told.history.doubts["camera"] = Doubt(told.now, told.now + 10**9)
+    told.history.doubts["camera"] = DisagreementSpell(told.now, told.now + 10**9)
     assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
-    told.history.trusted["camera"] = Seen(told.now + 3 * 10**9, (0.0,) * 12)  # nothing is known of what it saw
+    told.history.trusted["camera"] = StampedPose(told.now + 3 * 10**9, (0.0,) * 12)  # nothing is known of what it saw
     assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 3_200_000_000) == early
 
 
@@ -245,7 +245,7 @@ def test_a_doubt_ends_where_the_gate_lets_a_sensor_begin_anew():
     frames = list(sv.open_source("sim:room?image_width=160", frames=":30"))
     for frame in frames:
         mapper.add(frame)
-    mapper.map.history.doubts["camera"] = Doubt(0, frames[-1].stamp_ns, 40, 40, "moved")
+    mapper.map.history.doubts["camera"] = DisagreementSpell(0, frames[-1].stamp_ns, 40, 40, "moved")
     far = np.eye(4)
     far[0, 3] = 300.0
     found = [

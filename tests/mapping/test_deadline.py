@@ -207,7 +207,7 @@ def test_a_mapper_steps_down_leaves_out_and_comes_back(monkeypatch):
             reports.append(mapper.add(frame))
             if reports[-1].refused:
                 assert np.array_equal(before, mapper.map.storage.blocks()[1])
-    ways = [report.refused or report.way for report in reports]
+    ways = [report.refused or report.quality for report in reports]
     assert ways[:9] == ["full"] * 5 + ["near"] * 2 + ["coarse"] * 2
     assert "no_time" in ways[9:24]
     assert ways[-1] == "full"
@@ -219,7 +219,7 @@ def test_without_a_deadline_all_is_looked_at_in_full(monkeypatch):
     clock = Clock(monkeypatch)
     clock.frame_ms = 1e6
     mapper = sv.Mapper(voxel_size=0.1)
-    assert {mapper.add(stage()).way for _ in range(5)} == {"full"}
+    assert {mapper.add(stage()).quality for _ in range(5)} == {"full"}
 
 
 def test_a_near_range_before_all_that_is_seen_is_refused():

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 import stereovox as sv
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 
 CLEAR, FREE, TENTATIVE, RED = (0, 0, 0, 0), (226, 224, 212, 255), (232, 163, 61, 255), (224, 69, 47, 255)
 GREY, WALL = (128, 134, 145, 110), (34, 48, 74, 255)
@@ -74,7 +74,7 @@ def test_a_ceiling_is_left_out():
 def test_the_path_of_the_sensor_is_drawn():
     one = made_map([(0, 0, 0), (9, 4, 0)], [-2.0, -2.0])
     for x in (1.0, 8.0):
-        one.history.path.walk("", Seen(0, (1, 0, 0, x, 0, 1, 0, 2.5, 0, 0, 1, 0)))
+        one.history.path.walk("", StampedPose(0, (1, 0, 0, x, 0, 1, 0, 2.5, 0, 0, 1, 0)))
     image, text = picture(one._repr_html_())
     assert pixel(image, 4, 2, 10, 5) == RED
     assert pixel(image, 9, 2, 10, 5) == CLEAR

@@ -32,7 +32,7 @@ def settings(integrator="ray", **more):
 
 def mapped(image, config):
     voxel_map = make_map(config)
-    voxel_map.storage.look_from(Viewpoint(image.camera, image.T_world_sensor))
+    voxel_map.storage.set_viewpoint(Viewpoint(image.camera, image.T_world_sensor))
     voxel_map.add(make_integrator(config).evidence(image))
     return voxel_map
 

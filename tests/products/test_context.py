@@ -228,7 +228,7 @@ GROUPS = {
 ELSEWHERE = {
     "floor": "tests/products/test_floor_heights.py and tests/products/test_projection.py",
     ("sv.frontiers", "unknown"): "tests/products/test_frontiers.py",
-    ("sv.LevelWays", "unknown"): "tests/products/test_level_ways.py",
+    ("sv.LevelPlanner", "unknown"): "tests/products/test_level_ways.py",
     ("sv.ground", "up"): "tests/products/test_ground.py",
     ("obstacle topics", "unknown"): "tests/ros/test_obstacles.py",
 }

@@ -93,7 +93,7 @@ def test_a_field_follows_its_map(cell, to, steps):
 def stand(voxel_map, *position):
     pose = np.eye(4)
     pose[:3, 3] = position
-    voxel_map.storage.look_from(Viewpoint(0, pose))
+    voxel_map.storage.set_viewpoint(Viewpoint(0, pose))
 
 
 def test_a_window_follows_the_camera_and_keeps_nothing_of_where_it_was():

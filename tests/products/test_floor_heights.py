@@ -96,7 +96,7 @@ class Place:
 def seen_from(voxel_map, place):
     T = np.eye(4)
     T[:3, 3] = place
-    voxel_map.storage.look_from(Viewpoint(PinholeCamera.from_field_of_view(64, 48, 60.0), T))
+    voxel_map.storage.set_viewpoint(Viewpoint(PinholeCamera.from_field_of_view(64, 48, 60.0), T))
     return voxel_map
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_halls import hall
 
-from stereovox import LevelWays, State, StereovoxError, VoxelMap, load_config
+from stereovox import LevelPlanner, State, StereovoxError, VoxelMap, load_config
 
 WALL = ((0.9, -3, -1), (1.1, 0.5, 1))
 """From one side of a hall of 3 m each way to beyond its middle: the way round is at y above 0.5."""
@@ -12,8 +12,8 @@ WALL = ((0.9, -3, -1), (1.1, 0.5, 1))
 
 def test_ways_go_round_and_touch_only_what_is_free():
     voxel_map = hall(occupied=[WALL], size=3.0)
-    ways = LevelWays(voxel_map, (0, 0, 0), 0.3)
-    way = ways.way_to((2, 0, 0))
+    ways = LevelPlanner(voxel_map, (0, 0, 0), 0.3)
+    way = ways.path_to((2, 0, 0))
     assert way[0].tolist() == [0, 0, 0]
     assert way[-1] == pytest.approx([2, 0, 0], abs=0.1)
     assert way[:, 1].max() > 0.75
@@ -25,35 +25,35 @@ def test_ways_go_round_and_touch_only_what_is_free():
 def test_what_is_not_free_is_a_wall(what):
     closed = ((0.9, -3, -1), (1.1, 3, 1))
     voxel_map = hall(**{what: [closed]}, size=3.0)
-    assert LevelWays(voxel_map, (0, 0, 0), 0.3).way_to((2, 0, 0)) is None
+    assert LevelPlanner(voxel_map, (0, 0, 0), 0.3).path_to((2, 0, 0)) is None
 
 
 def test_gaps_are_as_wide_as_the_ball():
     gap = [((0.9, -3, -1), (1.1, -0.5, 1)), ((0.9, 0.5, -1), (1.1, 3, 1))]
     voxel_map = hall(occupied=gap, size=3.0)
-    assert LevelWays(voxel_map, (0, 0, 0), 0.3).way_to((2, 0, 0)) is not None
-    assert LevelWays(voxel_map, (0, 0, 0), 0.55).way_to((2, 0, 0)) is None
+    assert LevelPlanner(voxel_map, (0, 0, 0), 0.3).path_to((2, 0, 0)) is not None
+    assert LevelPlanner(voxel_map, (0, 0, 0), 0.55).path_to((2, 0, 0)) is None
 
 
 def test_heights_out_of_the_band_do_not_count():
     beam = ((0.9, -3, 0.5), (1.1, 3, 1))
     voxel_map = hall(occupied=[beam], size=3.0)
-    assert LevelWays(voxel_map, (0, 0, 0), 0.3, half_height=0.3).way_to((2, 0, 0)) is not None
-    assert LevelWays(voxel_map, (0, 0, 0.3), 0.3, half_height=0.3).way_to((2, 0, 0)) is None
+    assert LevelPlanner(voxel_map, (0, 0, 0), 0.3, half_height=0.3).path_to((2, 0, 0)) is not None
+    assert LevelPlanner(voxel_map, (0, 0, 0.3), 0.3, half_height=0.3).path_to((2, 0, 0)) is None
 
 
 def test_the_own_place_may_be_unknown_but_not_occupied():
     about = ((-0.4, -0.4, -1), (0.4, 0.4, 1))
     unseen = hall(unknown=[about], size=3.0)
-    assert LevelWays(unseen, (0, 0, 0), 0.3).way_to((2, 0, 0)) is None
-    assert LevelWays(unseen, (0, 0, 0), 0.3, own_radius=0.7).way_to((2, 0, 0)) is not None
+    assert LevelPlanner(unseen, (0, 0, 0), 0.3).path_to((2, 0, 0)) is None
+    assert LevelPlanner(unseen, (0, 0, 0), 0.3, own_radius=0.7).path_to((2, 0, 0)) is not None
     blocked = hall(occupied=[about], size=3.0)
-    assert LevelWays(blocked, (0, 0, 0), 0.3, own_radius=0.7).way_to((2, 0, 0)) is None
+    assert LevelPlanner(blocked, (0, 0, 0), 0.3, own_radius=0.7).path_to((2, 0, 0)) is None
 
 
 def test_the_middle_has_the_most_room():
     voxel_map = hall(occupied=[WALL], size=3.0)
-    place, room = LevelWays(voxel_map, (-2, -2, 0), 0.3).middle()
+    place, room = LevelPlanner(voxel_map, (-2, -2, 0), 0.3).middle()
     assert room == pytest.approx(1.9, abs=0.2)
     assert place[0] == pytest.approx(-1.05, abs=0.3)
     assert voxel_map.nearest_obstacle(place).distance[0] >= room
@@ -62,17 +62,17 @@ def test_the_middle_has_the_most_room():
 
 def test_the_middle_of_another_room_does_not_count():
     closed = ((-0.1, -3, -1), (0.1, 3, 1))
-    place, _ = LevelWays(hall(occupied=[closed], size=3.0), (1.5, 2, 0), 0.3).middle()
+    place, _ = LevelPlanner(hall(occupied=[closed], size=3.0), (1.5, 2, 0), 0.3).middle()
     assert place[0] > 0
-    assert LevelWays(hall(size=3.0), (50, 0, 0), 0.3).middle() is None
+    assert LevelPlanner(hall(size=3.0), (50, 0, 0), 0.3).middle() is None
 
 
 def test_bad_values_are_refused():
     with pytest.raises(StereovoxError, match="not empty"):
-        LevelWays(VoxelMap(load_config()), (0, 0, 0), 0.3)
+        LevelPlanner(VoxelMap(load_config()), (0, 0, 0), 0.3)
     with pytest.raises(StereovoxError, match="give metres"):
-        LevelWays(hall(size=1.0), (0, 0, 0), -1)
+        LevelPlanner(hall(size=1.0), (0, 0, 0), -1)
     with pytest.raises(StereovoxError, match="give a point"):
-        LevelWays(hall(size=1.0), (0, np.nan, 0), 0.3)
+        LevelPlanner(hall(size=1.0), (0, np.nan, 0), 0.3)
     with pytest.raises(StereovoxError, match="--level"):
-        LevelWays(hall(size=1.0, up="y"), (0, 0, 0), 0.3)
+        LevelPlanner(hall(size=1.0, up="y"), (0, 0, 0), 0.3)

@@ -34,7 +34,7 @@ def on_disk(voxel_map):
     same, moving = VoxelMap(config), RollingMap(config)
     same.storage.insert(*voxel_map.storage.blocks())
     moving.storage.go_on_with(same.storage)
-    moving.storage.look_from(made.at((5.0, 5.0, 5.0)))
+    moving.storage.set_viewpoint(made.at((5.0, 5.0, 5.0)))
     return moving
 
 
@@ -140,7 +140,7 @@ def test_merged_halves_are_the_map_of_all_frames(halves):
     np.testing.assert_allclose(merged.ages(), both.ages(), atol=0.011)  # times count in steps of 10 ms
     assert (merged.frames, merged.viewpoint.stamp_ns) == (10, both.viewpoint.stamp_ns)
     assert merged.history.last_frame == both.history.last_frame
-    assert merged.history.ways == both.history.ways
+    assert merged.history.quality == both.history.quality
 
 
 def test_a_merged_map_is_saved_with_what_it_says(halves, tmp_path):

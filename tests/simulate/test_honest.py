@@ -11,11 +11,11 @@ from stereovox.errors import SourceError
 from stereovox.frame import Reason
 from stereovox.simulate import _texture
 from stereovox.simulate.d435 import CAMERA, D435, depth_camera, smooth_noise
-from stereovox.simulate.honest import HonestCamera, honest_d435, honest_kinect
+from stereovox.simulate.honest import RealisticDepthCamera, honest_d435, honest_kinect
 from stereovox.simulate.simulation import Simulation
 
 SHAPE = CAMERA.height, CAMERA.width
-PLAIN = HonestCamera(
+PLAIN = RealisticDepthCamera(
     step=1e-4, of_surface=0, holes=0, holes_far=0, holes_steep=0, holes_dark=0, repetitive=0, farthest=60
 )
 """Nothing but noise."""
@@ -126,7 +126,7 @@ def without_value(device, depth, seed=0):
 
 
 def test_holes_grow_with_range_and_angle_and_are_patchy():
-    device = HonestCamera()
+    device = RealisticDepthCamera()
     flat = [np.mean([without_value(device, np.full(SHAPE, z, np.float32), s) for s in range(4)]) for z in (1, 4, 8)]
     assert 0.01 < flat[0] < flat[1] < flat[2] < 0.5
     x, _ = CAMERA.ray_slopes()
@@ -140,7 +140,7 @@ def test_holes_grow_with_range_and_angle_and_are_patchy():
 def test_dark_surfaces_have_more_holes():
     from stereovox.simulate.honest import _Places
 
-    device = replace(HonestCamera(), holes_dark=0.4)
+    device = replace(RealisticDepthCamera(), holes_dark=0.4)
     depth = np.full(SHAPE, 2.0, np.float32)
     grey = _Places.of(device, depth, None, 3).grey()[:, 30:]
     holes = (device.measure(depth, [3, 0])[0] == 0)[:, 30:]
@@ -182,7 +182,7 @@ def test_the_same_seed_gives_the_same_image_and_another_another():
 
 def test_cameras_are_chosen_by_name():
     simulation = Simulation("sim:aisle?camera=d435&subpixel=0.1&correlation=1.2&image_width=424")
-    assert simulation.device == HonestCamera(
+    assert simulation.device == RealisticDepthCamera(
         depth_camera(424), subpixel=0.1, correlation_px=1.2, farthest=Simulation("sim:aisle").device.farthest
     )
     assert Simulation("sim:room?camera=kinect").camera.width == 640

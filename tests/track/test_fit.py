@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.geometry.se3 import inverse, rotation_matrix, rotation_vector
-from stereovox.track.fit import Stage, both, holding, settled
+from stereovox.track.fit import Stage, both, holding, solve_stages
 
 
 def pose(turn, shift):
@@ -37,7 +37,7 @@ def spread(seed):
 def test_a_linear_problem_is_solved_as_numpy_solves_it(seed):
     random, doubt = np.random.default_rng(seed), spread(seed)
     A, b = 2000 * random.standard_normal((20, 6)), 10 * random.standard_normal(20)
-    T, covariance = settled([linear(A, b)], EXPECTED, doubt)
+    T, covariance = solve_stages([linear(A, b)], EXPECTED, doubt)
     expectation = np.linalg.inv(np.linalg.cholesky(doubt))
     x, *_ = np.linalg.lstsq(np.vstack([A, expectation]), np.append(b, np.zeros(6)), rcond=None)
     assert np.abs(x).max() > 1e-4
@@ -49,7 +49,7 @@ def test_what_is_expected_counts_by_its_covariance():
     """One measurement as good as the expectation, along z: the pose is half way."""
     A, doubt = np.zeros((1, 6)), np.diag([0.1, 0.1, 0.1, 0.2, 0.2, 0.05]) ** 2
     A[0, 5] = 1 / 0.04
-    T, covariance = settled([linear(A, np.array([0.1 / 0.04]))], EXPECTED, doubt)
+    T, covariance = solve_stages([linear(A, np.array([0.1 / 0.04]))], EXPECTED, doubt)
     z = 0.1 / 0.04**2 / (1 / 0.04**2 + 1 / 0.05**2)
     assert off(T) == pytest.approx([0, 0, 0, 0, 0, z], abs=1e-9)
     assert np.diag(covariance)[5] == pytest.approx(1 / (1 / 0.04**2 + 1 / 0.05**2))
@@ -62,7 +62,7 @@ def test_an_axis_without_information_stays_as_expected_with_its_covariance(open_
     A, b = 500 * random.standard_normal((30, 6)), 5 * random.standard_normal(30)
     A[:, open_axis] = 0
     start = pose([0.01, -0.02, 0.01], [0.02, 0.01, -0.03]) @ EXPECTED
-    T, covariance = settled([linear(A, b)], EXPECTED, doubt, start)
+    T, covariance = solve_stages([linear(A, b)], EXPECTED, doubt, start)
     assert off(T)[open_axis] == pytest.approx(0, abs=1e-9)
     assert np.abs(np.delete(off(T), open_axis)).max() > 1e-4
     assert covariance[open_axis] == pytest.approx(doubt[open_axis], abs=1e-9)
@@ -77,7 +77,7 @@ def test_an_oblique_direction_without_information_does_so_too(seed):
     along = random.standard_normal(6)
     along /= np.linalg.norm(along)  # in deviations of the expectation
     A = 200 * random.standard_normal((30, 6)) @ (np.eye(6) - np.outer(along, along)) @ np.linalg.inv(L)
-    T, covariance = settled([linear(A, 50 * random.standard_normal(30))], EXPECTED, doubt)
+    T, covariance = solve_stages([linear(A, 50 * random.standard_normal(30))], EXPECTED, doubt)
     moved = np.linalg.solve(L, off(T))
     assert np.abs(moved).max() > 0.01
     assert along @ moved == pytest.approx(0, abs=1e-7)
@@ -88,7 +88,7 @@ def test_what_holds_less_than_the_expectation_does_not_hold():
     doubt = np.diag([0.1] * 6) ** 2
     for ratio, holds in ((0.5, False), (2.0, True)):
         A = np.diag([300, 300, 300, 300, 300, np.sqrt(ratio) / 0.1])
-        T, covariance = settled([linear(A, A @ np.full(6, 0.05))], EXPECTED, doubt)
+        T, covariance = solve_stages([linear(A, A @ np.full(6, 0.05))], EXPECTED, doubt)
         assert off(T)[5] == pytest.approx(0.05 * ratio / (1 + ratio) if holds else 0, abs=1e-6)
         assert covariance[5, 5] == pytest.approx(0.01 / (1 + ratio) if holds else 0.01)
 
@@ -104,7 +104,7 @@ def test_each_stage_goes_on_from_the_one_before_and_the_last_one_counts():
         return Stage(equations, 1e-9)
 
     coarse, fine = np.full(6, 0.04), np.full(6, 0.05)
-    T, covariance = settled([measured(coarse, 0.01), measured(fine, 0.001)], EXPECTED, np.diag([1.0] * 6))
+    T, covariance = solve_stages([measured(coarse, 0.01), measured(fine, 0.001)], EXPECTED, np.diag([1.0] * 6))
     assert off(T) == pytest.approx(fine, abs=1e-6)
     assert np.diag(covariance) == pytest.approx(1e-6, rel=1e-3)
     first_of_fine = next(x for sigma, x in asked if sigma == 0.001)
@@ -127,7 +127,7 @@ def test_large_turns_are_found_as_the_closed_form_finds_them():
             gradient += J.T @ (place - arm - T[:3, 3]) / 0.01**2
         return information, gradient
 
-    T, _ = settled([Stage(equations, 1e-12)] * 3, EXPECTED, np.diag([1e4] * 6))
+    T, _ = solve_stages([Stage(equations, 1e-12)] * 3, EXPECTED, np.diag([1e4] * 6))
     U, _, V = np.linalg.svd((here - here.mean(0)).T @ (there - there.mean(0)))
     R = V.T @ np.diag([1, 1, np.sign(np.linalg.det(U) * np.linalg.det(V))]) @ U.T
     assert T[:3, :3] == pytest.approx(R, abs=1e-7)
@@ -144,11 +144,11 @@ def test_what_holds_nothing_takes_nothing_away_from_what_does(seed):
     feigned = lambda T: (wall(T)[0] - 3e7 * np.eye(6), wall(T)[1])  # noqa: E731
     B, b = 900 * random.standard_normal((20, 6)), 10 * random.standard_normal(20)
     seen = linear(B, b)
-    alone = settled([seen], EXPECTED, doubt)[1]
-    T, covariance = settled([Stage(both(holding(feigned, doubt), seen.equations), 1e-12)], EXPECTED, doubt)
+    alone = solve_stages([seen], EXPECTED, doubt)[1]
+    T, covariance = solve_stages([Stage(both(holding(feigned, doubt), seen.equations), 1e-12)], EXPECTED, doubt)
     assert np.linalg.eigvalsh(alone - covariance).min() > -1e-12  # more is known, in no direction less
     assert np.trace(covariance) < 0.9 * np.trace(alone)
-    without = settled([Stage(both(feigned, seen.equations), 1e-12)], EXPECTED, doubt)[1]
+    without = solve_stages([Stage(both(feigned, seen.equations), 1e-12)], EXPECTED, doubt)[1]
     assert np.trace(without) > 2 * np.trace(alone)  # the control: as it would be
     assert np.linalg.norm(off(T)) < 0.05
 

@@ -15,7 +15,7 @@ from stereovox.frame import DepthImage, Photo
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_source
 from stereovox.simulate.scene import Scene, cylinder
-from stereovox.track.photos import Beside, inverse_depths
+from stereovox.track.photos import PhotoLandmarks, inverse_depths
 from stereovox.track.sightings import Corners, Sightings
 from stereovox.track.tracker import Tracker
 
@@ -70,7 +70,7 @@ def test_equations_of_a_camera_that_is_carried_lead_to_the_pose_of_what_carries_
     inverse = random.uniform(0.2, 1, 50)
     corners = Corners(np.zeros((50, 2), np.float32), np.tile(at[:3, 3], (50, 1)), ray, inverse, np.full(50, 1e-5))
     measured = np.array([(*naive.seen_at(p, at, LENS),) for p in corners.points])
-    equations = Beside(
+    equations = PhotoLandmarks(
         Sightings(PHOTO_CAMERA, corners, measured, np.full(50, 0.003), 50), T_sensor_camera, np.zeros((6, 6))
     ).equations()
     off = T.copy()

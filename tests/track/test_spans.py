@@ -4,7 +4,7 @@ from dataclasses import replace
 from made_unposed import room
 
 from stereovox.frame import UpdateReport
-from stereovox.track.spans import LostSpan, LostSpans
+from stereovox.track.spans import LostSpans, TrackingGap
 
 
 def spans(words, number=0):
@@ -16,17 +16,17 @@ def spans(words, number=0):
 
 def test_frames_in_a_row_are_one_span_with_the_first_reason():
     found = spans(["", "dark", "bare", "", "", "dark"])
-    assert found.spans == [LostSpan(1, 2, 100, 200, "dark"), LostSpan(5, 5, 500, 500, "dark")]
+    assert found.spans == [TrackingGap(1, 2, 100, 200, "dark"), TrackingGap(5, 5, 500, 500, "dark")]
     assert (found.lost, found.frames) == (3, 6)
 
 
 def test_numbers_go_on_where_a_run_does():
-    assert spans(["dark", "dark"], 7).spans == [LostSpan(7, 8, 0, 100, "dark")]
+    assert spans(["dark", "dark"], 7).spans == [TrackingGap(7, 8, 0, 100, "dark")]
 
 
 def test_a_span_is_one_line():
-    assert LostSpan(5, 5, 0, 0, "dark").line() == "lost in frame 5: dark"
-    assert LostSpan(5, 19, 10**9, 3 * 10**9, "dark").line() == "lost from frame 5 to 19 (2.0 s): dark"
+    assert TrackingGap(5, 5, 0, 0, "dark").line() == "lost in frame 5: dark"
+    assert TrackingGap(5, 19, 10**9, 3 * 10**9, "dark").line() == "lost from frame 5 to 19 (2.0 s): dark"
 
 
 def test_a_frame_without_a_pose_is_lost_and_one_that_the_map_refuses_is_not():

@@ -107,16 +107,16 @@ def test_without_a_start_the_first_camera_looks_along_x_and_level():
 
 
 @pytest.mark.parametrize(
-    ("known", "usual", "words"),
+    ("known", "inlier_share", "words"),
     [
         (0.19, 1.0, "19% of what it sees is known, 20% is needed"),
         (1.0, 0.59, "59% of what is known lies where it should, 60% is needed"),
         (0.21, 0.61, ""),
     ],
 )
-def test_what_must_be_known_and_where_it_should_be_while_following(known, usual, words):
-    assert _doubt(Fit(np.eye(4), np.eye(6), known, usual), FOLLOWING) == words
-    assert _doubt(Fit(np.eye(4), np.eye(6), known, usual), RETURNING)  # to come back takes more
+def test_what_must_be_known_and_where_it_should_be_while_following(known, inlier_share, words):
+    assert _doubt(Fit(np.eye(4), np.eye(6), known, inlier_share), FOLLOWING) == words
+    assert _doubt(Fit(np.eye(4), np.eye(6), known, inlier_share), RETURNING)  # to come back takes more
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import lay
+from stereovox.evaluate.grids.grid_lattice import aligned_grids
 from stereovox.evaluate.grids.grid_scores import Difference, differences, laid_on, score_laid, wrong
 from stereovox.geometry import se2
 from stereovox.maps import State
@@ -80,7 +80,7 @@ def test_a_thin_wall_is_not_lost_in_a_small_picture():
 
 
 def test_the_binary_image_has_a_pixel_for_each_cell_with_north_up():
-    laid = lay(random_floor(2), random_floor(1), exclude=[(0, 0, 1, 1)])
+    laid = aligned_grids(random_floor(2), random_floor(1), exclude=[(0, 0, 1, 1)])
     image = imread(io.BytesIO(binary_png(laid)))[..., 0]
     assert (image[::-1] == wrong(differences(laid))).all()
     assert 0 < image.mean() < 1
@@ -88,7 +88,7 @@ def test_the_binary_image_has_a_pixel_for_each_cell_with_north_up():
 
 
 def test_each_kind_of_cell_has_a_colour_of_its_own():
-    laid = lay(random_floor(2, (30, 40)), random_floor(1, (30, 40)), exclude=[(0, 0, 3, 3)])
+    laid = aligned_grids(random_floor(2, (30, 40)), random_floor(1, (30, 40)), exclude=[(0, 0, 3, 3)])
     found = classes(laid)
     assert set(np.unique(found)) == set(KINDS)
     assert len({colour for _, colour in KINDS.values()}) == len(KINDS)
@@ -104,7 +104,7 @@ def test_each_kind_of_cell_has_a_colour_of_its_own():
 
 @pytest.mark.parametrize("shape", [(20, 90), (60, 40)])
 def test_maps_of_any_shape_are_shown_side_by_side(shape):
-    laid = lay(random_floor(2, shape), random_floor(1, shape))
+    laid = aligned_grids(random_floor(2, shape), random_floor(1, shape))
     drawn = imread(io.BytesIO(side_by_side_png(laid)))[..., :3]
     for colour in ("white", "black", STATE_COLOURS[State.OCCUPIED], STATE_COLOURS[State.UNKNOWN]):
         assert (np.abs(drawn - to_rgb(colour)).max(axis=2) < 0.01).sum() > 20, colour

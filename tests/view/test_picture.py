@@ -7,7 +7,7 @@ from matplotlib.text import Text
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS, round_length
 from stereovox.view.picture import picture
 from stereovox.view.scene.drawn import camera_path, ceiling, upright
@@ -50,7 +50,7 @@ def seen_from(*places, sensor="camera"):
     voxel_map = a_room()
     for n, place in enumerate(places):
         pose = np.column_stack([np.eye(3), place])
-        voxel_map.history.path.walk(sensor, Seen(n, tuple(pose.ravel().tolist())))
+        voxel_map.history.path.walk(sensor, StampedPose(n, tuple(pose.ravel().tolist())))
     return voxel_map
 
 
@@ -71,7 +71,9 @@ def test_a_picture_shows_the_path_that_the_map_remembers():
 
 def test_a_path_breaks_where_it_leaves_the_map_and_between_cameras():
     voxel_map = seen_from([0.5, 0.5, 1], [1, 1, 1], [50, 1, 1], [2, 1, 1])
-    voxel_map.history.path.walk("other", Seen(9, tuple(np.column_stack([np.eye(3), [3, 1, 1]]).ravel().tolist())))
+    voxel_map.history.path.walk(
+        "other", StampedPose(9, tuple(np.column_stack([np.eye(3), [3, 1, 1]]).ravel().tolist()))
+    )
     x = camera_path(voxel_map)[:, 0]
     np.testing.assert_array_equal(x, [0.5, 1, np.nan, 2, np.nan, 3])
     far = seen_from([50, 1, 1], [60, 1, 1])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from stereovox.frame import UpdateReport
-    from stereovox.track.spans import LostSpan
+    from stereovox.track.spans import TrackingGap
 
 MAX_SPANS = 10
 """Spans of lost frames that are printed."""
@@ -145,7 +145,7 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
         say(f"  {number} x {reason}")
 
 
-def say_lost(spans: Sequence[LostSpan]) -> None:
+def say_lost(spans: Sequence[TrackingGap]) -> None:
     """Print where the camera was lost: the longest spans, in order."""
     shown = sorted(sorted(spans, key=len)[-MAX_SPANS:], key=lambda span: span.first)
     for span in shown:

@@ -201,7 +201,7 @@ def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequ
     merged = VoxelMap(a.config)
     merged.history = together(a.history, b.history)
     merged.history.frames = len(frames)
-    merged.history.ways -= Counter(frame.quality for frame in twice)
+    merged.history.quality -= Counter(frame.quality for frame in twice)
     merged.storage.kept = KeptFrames(a.config.map.frames_budget, frames)
     rebuild = Rebuild(merged.storage, Levels(a.config), {}, whole=True)
     rebuild.catch_up()

@@ -46,7 +46,7 @@ def describe_map(path: str) -> Description | None:
         "made_of": voxel_map.history.made_of(),
         "refused": dict(voxel_map.history.refused.most_common()),
         "settled": dict(voxel_map.history.settled),
-        "ways": dict(voxel_map.history.ways),
+        "quality": dict(voxel_map.history.quality),
         "boxes": _boxes(voxel_map),
         "kept_frames": None if kept is None else {"frames": len(kept), "bytes": kept.bytes},
         "loops": None if voxel_map.history.loops is None else voxel_map.history.loops.counts(),
@@ -151,7 +151,7 @@ def _lines(result: dict[str, Any]) -> list[str]:
         lines.append(f"  {number} x {reason}")
     for reason, number in result["settled"].items():
         lines.append(f"  {number} x accepted again after {reason}")
-    reduced = {quality: number for quality, number in result["ways"].items() if quality != FULL}
+    reduced = {quality: number for quality, number in result["quality"].items() if quality != FULL}
     if reduced:
         lines.append(
             f"mapped at reduced quality: {', '.join(f'{number} x {quality}' for quality, number in reduced.items())}"

@@ -20,7 +20,7 @@ from stereovox.descriptions.description import (
 )
 from stereovox.errors import NoPoses, StereovoxError, without_name
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
-from stereovox.runs.survey import LEVEL_ENOUGH, TILTED, Survey, Up, survey
+from stereovox.runs.survey import LEVEL_ENOUGH, TILTED, Survey, UpEstimate, survey
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
@@ -166,7 +166,7 @@ def _pose_lines(found: Survey) -> list[str]:
     ]
 
 
-def _up_line(up: Up) -> str:
+def _up_line(up: UpEstimate) -> str:
     if not up.sure:
         return f"which way is up is not certain, perhaps {up.axis} ({up.why})"
     tilted = f"; {TILTED}" if up.off > LEVEL_ENOUGH else ""

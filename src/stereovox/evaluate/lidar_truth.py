@@ -259,7 +259,7 @@ class _Truth:
         voxel_map = VoxelMap(self.config)
         voxel_map.history = History(counts.frames, Counter(counts.refused), recording=self.source.name)
         if self._last is not None:
-            voxel_map.storage.look_from(self._last)
+            voxel_map.storage.set_viewpoint(self._last)
         coords, cells = self._cells()
         voxel_map.storage.insert(coords, cells)
         states = voxel_map.counts()

@@ -17,8 +17,8 @@ from stereovox.maps.grid_map import GridMap
 def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
     """Summarise frames, refusals by reason, quality levels, milliseconds, cells and memory of a run.
 
-    `settled`: how often frames were accepted again after a jump or a reset, by the report's description. `ways`: number
-    of frames by quality level, full or reduced to meet the deadline (docs/safety.md).
+    `settled`: how often frames were accepted again after a jump or a reset, by the report's description. `quality`:
+    number of frames by quality level, full or reduced to meet the deadline (docs/safety.md).
     `frame_ms` is the whole of a frame, `match_ms` (of stereo pairs alone), `depth_ms` and `integrate_ms` are its parts.
     Times leave out the first mapped frame, which may compile kernels. `memory_reserved`: the memory is that of a
     window, reserved at the start.
@@ -30,7 +30,7 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
         "frames_refused": refused.total(),
         "refused": dict(refused.most_common()),
         "settled": dict(Counter(report.detail for report in mapped if report.detail).most_common()),
-        "ways": dict(Counter(report.way for report in mapped).most_common()),
+        "quality": dict(Counter(report.quality for report in mapped).most_common()),
         "match_ms": percentiles([report.match_ms for report in mapped if report.match_ms]),
         "depth_ms": percentiles([report.depth_ms for report in mapped]),
         "integrate_ms": percentiles([report.integrate_ms for report in mapped]),

@@ -96,7 +96,7 @@ def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
                 level = levels(frame.quality)
                 image = level.prepare(read_frame(place, piece.recording, frame)).image
                 storage.history.frames = piece.before + frame.number
-                storage.look_from(image.viewpoint)
+                storage.set_viewpoint(image.viewpoint)
                 storage.add(_within(level.integrator.evidence(image), low, high))
     done = DoneBox(write_box(place, layout, box.at, storage), perf_counter() - started)
     place.write(f"{DONE}/{box.inputs(layout)}.json", sealed({"done": saved(done)}))

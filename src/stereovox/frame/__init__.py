@@ -48,11 +48,6 @@ class UpdateReport:
     match_ms: float = 0.0
     quality: str = "full"
 
-    @property
-    def way(self) -> str:
-        """Older name of `quality`."""
-        return self.quality
-
 
 class Reason(IntEnum):
     """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range.

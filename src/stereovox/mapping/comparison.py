@@ -16,11 +16,11 @@ from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
-from stereovox.mapping.gate import Gate, Passed
+from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.record.glance import Glance, Votes
-from stereovox.maps.record.history import Doubt
+from stereovox.maps.record.history import DisagreementSpell
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 from stereovox.sensors.noise import RangeNoise
@@ -92,8 +92,8 @@ class Comparison:
         self._prepared = False
 
     def check(
-        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: Passed, voxel_map: VoxelMap
-    ) -> Passed:
+        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
+    ) -> GateResult:
         """Return what the gate needs to accept the frame.
 
         evidence: what was made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
@@ -115,7 +115,7 @@ class Comparison:
             self._sight(image, None, voxel_map)
             pose_on_surfaces(voxel_map, image)
 
-    def _sight(self, image: AnyImage, doubt: Doubt | None, voxel_map: VoxelMap) -> Sight:
+    def _sight(self, image: AnyImage, doubt: DisagreementSpell | None, voxel_map: VoxelMap) -> Sight:
         """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
         T, seen = image.T_world_sensor, _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range)
         points = _thinned(seen, POINTS)

@@ -9,7 +9,7 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, name_of
 from stereovox.maps.record.glance import Glance, Votes
-from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, Doubt, History, RunningMean
+from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, DisagreementSpell, History, RunningMean
 
 DISAGREES, CONTRADICTS, CAMERA_MOVED = "disagrees_with_map", "contradicts_map", "camera_moved"
 """Refusal reasons: while a doubt is young, once it has lasted for `trust.changed_s`, and where another pose fits."""
@@ -114,7 +114,7 @@ class Agreement(NamedTuple):
     """
 
     against: float | None
-    doubt: Doubt | None = None
+    doubt: DisagreementSpell | None = None
     after: str = ""
 
 
@@ -161,7 +161,7 @@ class DisagreementMonitor:
         if sight is None:
             return Agreement(against, before if against is None else None)
         limit = self.limit(sensor, stamp_ns)
-        doubt = Doubt(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
+        doubt = DisagreementSpell(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
         if sight.agrees and self._lasted(doubt, self._changed_ns):
             return Agreement(1 - (sight.anchored or 0.0) if against is None else against)
         doubt = self._judged(doubt, sight)
@@ -187,10 +187,10 @@ class DisagreementMonitor:
         stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
         return max(stamps_ns, default=now_ns)
 
-    def _agrees(self, doubt: Doubt | None, sensor: str, stamp_ns: int, against: float) -> bool:
+    def _agrees(self, doubt: DisagreementSpell | None, sensor: str, stamp_ns: int, against: float) -> bool:
         return against <= self.limit(sensor, stamp_ns, AGAIN if doubt else 1.0)
 
-    def _judged(self, doubt: Doubt, sight: Sight) -> Doubt:
+    def _judged(self, doubt: DisagreementSpell, sight: Sight) -> DisagreementSpell:
         """Return a doubt after one more frame."""
         outcome = sight.outcome
         looks = doubt.looks + 1 if not outcome else doubt.looks if outcome == "still" else 0
@@ -204,20 +204,20 @@ class DisagreementMonitor:
             return doubt._replace(verdict=CHANGED if waited else MOVED)
         return doubt
 
-    def _lasted(self, doubt: Doubt, enough_ns: int) -> bool:
+    def _lasted(self, doubt: DisagreementSpell, enough_ns: int) -> bool:
         return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns
 
-    def _remember(self, sensor: str, doubt: Doubt) -> None:
+    def _remember(self, sensor: str, doubt: DisagreementSpell) -> None:
         if sensor in self._history.doubts or len(self._history.doubts) < MAX_SENSORS:
             self._history.doubts[sensor] = doubt
 
-    def _reason(self, doubt: Doubt) -> str:
+    def _reason(self, doubt: DisagreementSpell) -> str:
         if doubt.verdict == MOVED:
             return CAMERA_MOVED
         return CONTRADICTS if self._lasted(doubt, self._changed_ns) else DISAGREES
 
     def _refusal(
-        self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt, sight: Sight
+        self, frame: AnyFrame, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
     ) -> FrameRefused:
         detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
         if against is None:

@@ -17,7 +17,15 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
-from stereovox.maps.record.history import MAX_NAME_LENGTH, MAX_SENSORS, Doubt, History, Look, Seen, Streak
+from stereovox.maps.record.history import (
+    MAX_NAME_LENGTH,
+    MAX_SENSORS,
+    DisagreementSpell,
+    History,
+    ImageFingerprint,
+    StampedPose,
+    Streak,
+)
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
 """Pose noise: a step this small is no jump, however short the time."""
@@ -33,7 +41,7 @@ ROUGH, ROUGH_SHARE = 1e-3, 0.2
 not, and look the same from many places."""
 
 
-class Passed(NamedTuple):
+class GateResult(NamedTuple):
     """A frame that passed the gate: its sensor, stamp and pose.
 
     after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None for scans. agreement:
@@ -41,9 +49,9 @@ class Passed(NamedTuple):
     """
 
     sensor: str
-    seen: Seen
+    seen: StampedPose
     after: str = ""
-    look: Look | None = None
+    look: ImageFingerprint | None = None
     agreement: Agreement | None = None
 
     @property
@@ -70,7 +78,7 @@ class Gate:
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> Passed:
+    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> GateResult:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -79,21 +87,23 @@ class Gate:
         """
         sensor, stamp_ns = self._identify(frame)
         numbers = image.T_world_sensor.ravel().tolist()
-        now = Seen(stamp_ns, tuple(numbers[:12]))
+        now = StampedPose(stamp_ns, tuple(numbers[:12]))
         passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
         if passed.after:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
         return passed
 
-    def in_doubt(self, passed: Passed, against: float | None) -> bool:
+    def in_doubt(self, passed: GateResult, against: float | None) -> bool:
         """Return as `DisagreementMonitor.in_doubt`."""
         return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
 
-    def doubt(self, passed: Passed) -> Doubt | None:
+    def doubt(self, passed: GateResult) -> DisagreementSpell | None:
         """Return the doubt that frames of its sensor are in, None where they agree."""
         return self._history.doubts.get(passed.sensor)
 
-    def check_agreement(self, frame: AnyFrame, passed: Passed, against: float | None, sight: Sight | None) -> Passed:
+    def check_agreement(
+        self, frame: AnyFrame, passed: GateResult, against: float | None, sight: Sight | None
+    ) -> GateResult:
         """Return what `accept` needs of a frame that was compared with the map.
 
         Arguments and errors: as `DisagreementMonitor.check`.
@@ -101,7 +111,7 @@ class Gate:
         agreement = self._monitor.check(frame, passed.sensor, passed.seen.stamp_ns, against, sight)
         return passed._replace(agreement=agreement, after=passed.after or agreement.after)
 
-    def accept(self, passed: Passed) -> None:
+    def accept(self, passed: GateResult) -> None:
         """Remember a frame that the map took in."""
         self._history.trusted[passed.sensor] = passed.seen
         self._history.waiting.pop(passed.sensor, None)
@@ -125,11 +135,11 @@ class Gate:
         usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
         return frame.sensor or usual, int(frame.stamp_ns)
 
-    def _look(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Look | None:
+    def _look(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> ImageFingerprint | None:
         """Return the frame's checksum. Raises FrameRefused for a repeated image although the sensor has moved."""
         if not self._trust.frozen:
             return None
-        look, before = Look(_digest(frame), now.pose), self._history.looks.get(sensor)
+        look, before = ImageFingerprint(_digest(frame), now.pose), self._history.looks.get(sensor)
         if before is None or before.digest != look.digest:
             return look
         metres, angle = apart(before.pose, now.pose)
@@ -139,20 +149,20 @@ class Gate:
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
 
-    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Passed:
+    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one, or that is accepted again."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
             if len(self._history.trusted) >= MAX_SENSORS:
                 raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MAX_SENSORS} sensors; name fewer")
-            return Passed(sensor, now)
+            return GateResult(sensor, now)
         why, haste = self._against(trusted, now)
         waiting = self._history.waiting.get(sensor)
         if waiting is None and not why:
-            return Passed(sensor, now)
-        return self._settled(frame, Passed(sensor, now), trusted, (why, haste), waiting)
+            return GateResult(sensor, now)
+        return self._settled(frame, GateResult(sensor, now), trusted, (why, haste), waiting)
 
-    def _against(self, before: Seen, now: Seen) -> tuple[str, float]:
+    def _against(self, before: StampedPose, now: StampedPose) -> tuple[str, float]:
         """Return why `now` cannot follow `before` ("": it can), and its speed as a share of what is allowed."""
         ahead_ns = now.stamp_ns - before.stamp_ns
         if self._trust.ordered and (ahead_ns < 0 or ahead_ns > self._ahead_ns):
@@ -166,8 +176,13 @@ class Gate:
         return (JUMP if haste > 1 else ""), haste
 
     def _settled(
-        self, frame: AnyFrame | Scan, passed: Passed, trusted: Seen, found: tuple[str, float], waiting: Streak | None
-    ) -> Passed:
+        self,
+        frame: AnyFrame | Scan,
+        passed: GateResult,
+        trusted: StampedPose,
+        found: tuple[str, float],
+        waiting: Streak | None,
+    ) -> GateResult:
         """Return the frame where it may be accepted although it does not fit or others wait; otherwise refuse it."""
         (why, haste), now = found, passed.seen
         follows, slower = False, False
@@ -188,7 +203,7 @@ class Gate:
         self._history.waiting[passed.sensor] = Streak(why, since_ns, now)
         raise FrameRefused(why, detail)
 
-    def _detail(self, why: str, before: Seen, now: Seen) -> str:
+    def _detail(self, why: str, before: StampedPose, now: StampedPose) -> str:
         seconds = (now.stamp_ns - before.stamp_ns) / 1e9
         if why == BACKWARDS:
             return f"taken {-seconds:.6g} s before the last trusted one; put frames in order or set trust.ordered=false"

@@ -13,7 +13,7 @@ from stereovox.frame import AnyFrame, AnyImage, Scan, UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.wall_clock import epoch_ns
 from stereovox.kernels.threads import MapLock
-from stereovox.mapping.gate import Gate, Passed
+from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.record.health import FULL, Health, HealthMonitor
@@ -40,7 +40,7 @@ class Intake:
         self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
         self._map, self._adding = target, MapLock()
 
-    def offer(self, frame: AnyFrame | Scan) -> Offer:
+    def offer(self, frame: AnyFrame | Scan) -> PendingFrame:
         """Return a frame that arrives now; enter it with `with` while the map takes it in.
 
         Raises:
@@ -48,7 +48,7 @@ class Intake:
         """
         arrived_ns = self.monitor.now()
         self._map.lock.refuse_holder()
-        return Offer(self, frame, arrived_ns)
+        return PendingFrame(self, frame, arrived_ns)
 
     def closed(self) -> AbstractContextManager[object]:
         """Return what lets no frame in while it is entered."""
@@ -107,7 +107,7 @@ class Aged:
         return max(self._intake.monitor.stamps.age_ns(stamp_ns, now_ns), now_ns - came_ns)
 
 
-class Offer:
+class PendingFrame:
     """A frame on its way into the map. While it is entered, others wait; a FrameRefused inside the block ends there.
 
     Attributes:
@@ -120,7 +120,7 @@ class Offer:
     def __init__(self, intake: Intake, frame: AnyFrame | Scan, arrived_ns: int):
         self._intake, self._frame, self._arrived_ns = intake, frame, arrived_ns
 
-    def __enter__(self) -> Offer:
+    def __enter__(self) -> PendingFrame:
         self._intake._adding.acquire()
         return self
 
@@ -133,13 +133,13 @@ class Offer:
         finally:
             self._intake._adding.release()
 
-    def check(self, image: AnyImage | Scan) -> Passed:
+    def check(self, image: AnyImage | Scan) -> GateResult:
         """Check the frame, of which `image` was made, and return what `accept` needs. Raises as `Gate.check`."""
         intake = self._intake
         with intake._map.lock:
             return intake.gate.check(self._frame, image)
 
-    def accept(self, passed: Passed, quality: str = FULL) -> None:
+    def accept(self, passed: GateResult, quality: str = FULL) -> None:
         """Record that the map took the frame in; call it under the same hold of the map's lock."""
         intake, history = self._intake, self._intake._map.history
         history.offered(self._frame)

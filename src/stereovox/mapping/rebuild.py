@@ -30,7 +30,7 @@ from stereovox.kernels.threads import Ahead, uninterrupted
 from stereovox.maps import make_map
 from stereovox.maps.cells import _pool
 from stereovox.maps.cells.evidence import Evidence
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 from stereovox.maps.record.corrected import correct_history, matrix_of
 from stereovox.maps.record.kept_frames import KeptFrame, KeptFrames, blocks_seen
 from stereovox.maps.storage.blocks import CELLS, BlockPool
@@ -231,7 +231,7 @@ class Rebuild:
                 self._expect(next(coming, None))
                 frame = self._mapped_again(frame)
             else:
-                self._scratch.look_from(_viewpoint(frame))
+                self._scratch.set_viewpoint(_viewpoint(frame))
             self._after.append(frame)
 
     def finish(self) -> CorrectionReport:
@@ -303,11 +303,11 @@ class Rebuild:
         """Map a frame, and return it with what it sees from its pose."""
         image = self._loaded(frame).image
         evidence = self._level(frame.quality).integrator.evidence(image)
-        seen = Seen(frame.seen.stamp_ns, tuple(image.T_world_sensor.ravel().tolist()[:12]))
+        seen = StampedPose(frame.seen.stamp_ns, tuple(image.T_world_sensor.ravel().tolist()[:12]))
         frame = replace(frame, seen=seen, blocks=blocks_seen(evidence))
         evidence = self._part(evidence)
         self._check_room(evidence)
-        self._scratch.look_from(image.viewpoint)
+        self._scratch.set_viewpoint(image.viewpoint)
         self._scratch.add(evidence)
         self._mapped += 1
         return frame
@@ -332,12 +332,12 @@ class Rebuild:
         storage, scratch, last = self._storage, self._scratch, self._before[-1]
         if self._dirty is not None:
             changed = self._dirty.coords[: len(self._dirty)].copy()
-            storage.make_anew(changed, scratch)
+            storage.replace_blocks(changed, scratch)
             if last.number in self._moved:
                 storage.viewpoint = scratch.viewpoint
             return changed
         changed = np.concatenate([storage.coords_in_memory, scratch.coords_in_memory])
-        storage.become(scratch)
+        storage.replace_contents(scratch)
         return np.unique(changed, axis=0)
 
 

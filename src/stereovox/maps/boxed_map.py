@@ -24,7 +24,7 @@ from stereovox.maps.files.boxed_manifest import (
 from stereovox.maps.files.lock import LOCK
 from stereovox.maps.files.store import MANIFEST
 from stereovox.maps.query import queries
-from stereovox.maps.query.queries import Asked, NearestCells, RayHits
+from stereovox.maps.query.queries import NearestCells, QueryTarget, RayHits
 from stereovox.maps.storage.blocks import SIDE
 from stereovox.maps.storage.boxed_storage import CACHE_BYTES, BoxedStorage, Wanted, any_box
 from stereovox.maps.storage.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, write_box
@@ -172,11 +172,11 @@ class BoxedMap(VoxelMap):
         return self.overview()._repr_html_(title or type(self).__name__)
 
     @property
-    def _asked(self) -> Asked:
-        return Asked(self.storage.cells_here, self.storage.rules, self.config.cell)
+    def _asked(self) -> QueryTarget:
+        return QueryTarget(self.storage.cells_here, self.storage.rules, self.config.cell)
 
     @property
-    def _nothing(self) -> Asked:
+    def _nothing(self) -> QueryTarget:
         """A map of no cells, of which questions are asked only to check them."""
         return VoxelMap(self.config)._asked
 

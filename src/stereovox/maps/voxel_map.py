@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,13 +19,10 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.files.store import save_map
 from stereovox.maps.query import queries
 from stereovox.maps.query.queries import INDEX_LIMIT as INDEX_LIMIT
-from stereovox.maps.query.queries import Asked, NearestCells, RayHits
+from stereovox.maps.query.queries import NearestCells, QueryTarget, RayHits
 from stereovox.maps.record.kept_frames import KeptFrames
 from stereovox.maps.storage.blocks import CELLS, SIDE, blocks_of_cells, span_of
 from stereovox.maps.storage.storage import OnStorage, Storage
-
-IN_STORAGE = frozenset({"blocks_within", "insert", "slabs", "timed"})
-"""Names of `Storage` that were once reached at the map itself, and still are."""
 
 
 class OnBlocks(OnStorage):
@@ -400,16 +396,9 @@ class VoxelMap(Guarded, OnBlocks):
         """Remove what the map keeps outside memory (nothing, unless it keeps tiles on disk)."""
         self.storage.close()
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            if name in IN_STORAGE:
-                return getattr(self.storage, name)
-            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
-
     @property
-    def _asked(self) -> Asked:
-        return Asked(self.storage.stored_cells, self.storage.rules, self.config.cell)
+    def _asked(self) -> QueryTarget:
+        return QueryTarget(self.storage.stored_cells, self.storage.rules, self.config.cell)
 
     def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
         return self.storage.stored_at(queries.points_of(points))

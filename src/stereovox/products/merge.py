@@ -90,7 +90,7 @@ def together(a: History, b: History) -> History:
         frames=a.frames + b.frames,
         refused=_counts(a.refused + b.refused),
         settled=_counts(a.settled + b.settled),
-        ways=_counts(a.ways + b.ways),
+        quality=_counts(a.quality + b.quality),
         recording=" + ".join(names),
         last_frame=max(lasts, key=lambda last: last[1], default=None),
         path=_both_paths(a.path, b.path),

@@ -15,7 +15,7 @@ from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_
 from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
-from stereovox.maps.record.camera_path import CameraPath, Seen
+from stereovox.maps.record.camera_path import CameraPath, StampedPose
 from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved as _kernels
@@ -120,7 +120,7 @@ def _moved_path(path: CameraPath, T: Transform) -> CameraPath:
     there = CameraPath(path.spacing)
     for sensor, stops in path.stops.items():
         poses = (T @ path.poses(sensor))[:, :3].reshape(-1, 12).astype(np.float32).tolist()
-        there.stops[sensor] = [Seen(seen.stamp_ns, tuple(pose)) for seen, pose in zip(stops, poses, strict=True)]
+        there.stops[sensor] = [StampedPose(seen.stamp_ns, tuple(pose)) for seen, pose in zip(stops, poses, strict=True)]
     return there
 
 

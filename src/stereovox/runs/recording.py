@@ -47,7 +47,7 @@ from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.turned import Turned
 from stereovox.track.guided import GuidedTracker
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.spans import LostSpan, LostSpans
+from stereovox.track.spans import LostSpans, TrackingGap
 from stereovox.track.stream import AnyTracker, TrackedStream
 from stereovox.track.tracker import Tracker
 
@@ -106,7 +106,7 @@ class MapResult(Generic[MapT]):
     track: Track | None = None
     doubts: Sequence[MapDoubt] = ()
     poses: str = GIVEN
-    lost: Sequence[LostSpan] = ()
+    lost: Sequence[TrackingGap] = ()
     believed: int = 0
     imu: str = ""
     loops: LoopClosure | None = None

@@ -56,7 +56,7 @@ HORIZONTAL_SHARE = 0.06
 """Share of the surface that must be horizontal (floor, tables, ceiling) to confirm which way is up."""
 
 
-class Up(NamedTuple):
+class UpEstimate(NamedTuple):
     """Which way is up in the world of a recording.
 
     axis: the world's axis that is nearest, `z`, `-y` and so on. direction: (3,) unit vector. off: angle between both in
@@ -125,7 +125,7 @@ class Survey:
     unit_m: float | None
     unit_sure: bool
     unit_why: str
-    up: Up | None
+    up: UpEstimate | None
     max_range: Suggestion
     voxel_size: Suggestion
     notes: tuple[str, ...]
@@ -239,7 +239,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     )
 
 
-def find_up(source: Any, frames: list[AnyFrame]) -> Up:
+def find_up(source: Any, frames: list[AnyFrame]) -> UpEstimate:
     """Find out which way is up: as the layout defines it (`source.up`), by an accelerometer, else by what was seen.
 
     A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
@@ -254,27 +254,27 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     """
     known = getattr(source, "up", None)
     if known:
-        return Up(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
+        return UpEstimate(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
     gravity = source.gravity() if hasattr(source, "gravity") else None
     if gravity is not None:
         axis, off = _axis_near(gravity)
-        return Up(axis, gravity, off, True, "by the accelerometer")
+        return UpEstimate(axis, gravity, off, True, "by the accelerometer")
     mean = np.mean([_own_up(frame) for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:
         axis = nearest_axis(mean) if steady > 0 else "z"
-        return Up(axis, mean, float("nan"), False, "the camera was turned over on its way")
+        return UpEstimate(axis, mean, float("nan"), False, "the camera was turned over on its way")
     normals = [_normals(frame) for frame in frames if isinstance(frame, Frame) and frame.depth.size]
     normals = np.concatenate([np.empty((0, 3)), *normals])
     direction, share = _level_direction(mean / steady, normals)
     axis, off = _axis_near(direction)
     if _turns_level(frames, direction):
-        return Up(axis, direction, off, False, "the camera hardly turned about what is up in its images")
+        return UpEstimate(axis, direction, off, False, "the camera hardly turned about what is up in its images")
     if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
-        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
+        return UpEstimate(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
-    return Up(axis, direction, off, sure, why)
+    return UpEstimate(axis, direction, off, sure, why)
 
 
 def _axis_near(direction: NDArray[np.float64]) -> tuple[str, float]:

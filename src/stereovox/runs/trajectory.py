@@ -31,7 +31,7 @@ from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS, write_trajectory
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.spans import LostSpan, LostSpans
+from stereovox.track.spans import LostSpans, TrackingGap
 from stereovox.track.stream import LOST, follow
 from stereovox.track.tracker import Tracked, Tracker
 
@@ -59,7 +59,7 @@ class CameraTrack:
     stamps_ns: NDArray[np.int64]
     T_world_sensor: NDArray[np.float64]
     covariances: NDArray[np.float64]
-    lost: tuple[LostSpan, ...]
+    lost: tuple[TrackingGap, ...]
     frame_ms: NDArray[np.float64]
     score: TrajectoryScore | None = None
     imu: str = ""

@@ -44,7 +44,7 @@ HOLE_LASTS = 0.5
 
 
 @dataclass(frozen=True)
-class HonestCamera(D435):
+class RealisticDepthCamera(D435):
     """A depth camera with the errors of a real one. Lengths in pixels are those of its own image.
 
     subpixel: standard deviation of the disparity before it is rounded to steps.
@@ -140,18 +140,18 @@ class HonestCamera(D435):
         return field < _below(share)
 
 
-def honest_d435(own: D435) -> HonestCamera:
+def honest_d435(own: D435) -> RealisticDepthCamera:
     """Return a camera of the same size and limits that errs as the RealSense D400 family does."""
-    return HonestCamera(own.camera, nearest=own.nearest, farthest=own.farthest)
+    return RealisticDepthCamera(own.camera, nearest=own.nearest, farthest=own.farthest)
 
 
-def honest_kinect(width: int = WIDTH) -> HonestCamera:
+def honest_kinect(width: int = WIDTH) -> RealisticDepthCamera:
     """Return a Kinect of the first kind, whose image is `width` pixels wide: a picture of the full one.
 
     Khoshelham and Elberink (2012): steps of 1/8 pixel; it sees from 0.5 m on.
     """
     size = width / WIDTH
-    return HonestCamera(
+    return RealisticDepthCamera(
         replace(kinect_camera(width), subpixel=KINECT_TOTAL_PX * size),
         subpixel=0.056 * size, step=0.125 * size, correlation_px=1.5 * size, of_surface=0.15, of_pixel=0.25,
         nearest=0.5, farthest=6.0, edge_loss=0.0, flying=0.03,

@@ -46,7 +46,7 @@ class Fit(NamedTuple):
     T_map_camera: Transform
     covariance: NDArray[np.float64]
     known: float
-    usual: float
+    inlier_share: float
     fine: float = 1.0
 
 
@@ -76,7 +76,7 @@ def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
     """Return equations without the directions that they do not hold, to be added to others.
 
     There information that is less what noise feigns may be below 0: alone it holds nothing, and it must not take away
-    what other evidence holds. doubt: as that of `settled`.
+    what other evidence holds. doubt: as that of `solve_stages`.
     """
     scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
 
@@ -89,7 +89,7 @@ def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
     return held
 
 
-def settled(
+def solve_stages(
     stages: Iterable[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the pose (4, 4) that the stages lead to, and its covariance (6, 6) by the last one.

@@ -226,14 +226,14 @@ def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
     return imu, f"the IMU helps: turns and which way is up ({imu.name}{rate}); add imu=off behind a ? to do without"
 
 
-class Up(NamedTuple):
+class UpEstimate(NamedTuple):
     """Which way is up. direction: (3,) unit vector in the camera's frame. off: radians by which it may be wrong."""
 
     direction: NDArray[np.float64]
     off: float
 
 
-def up_by_force(imu: Imu, stamp_ns: int) -> Up | None:
+def up_by_force(imu: Imu, stamp_ns: int) -> UpEstimate | None:
     """Return which way is up at a time by the accelerometer.
 
     By the readings around it, turned by the gyroscope: at rest they feel what holds the camera up, and so they do on
@@ -250,7 +250,7 @@ def up_by_force(imu: Imu, stamp_ns: int) -> Up | None:
     rest = _rest(seconds[felt], force[felt], readings.angular_rate[felt])
     if rest is not None:
         up = up_of_force(rest)
-        return None if up is None else Up(up, RESTING)
+        return None if up is None else UpEstimate(up, RESTING)
     if np.ptp(seconds[felt]) < LEAST_S:
         return None
     half = len(force[felt]) // 2
@@ -258,7 +258,7 @@ def up_by_force(imu: Imu, stamp_ns: int) -> Up | None:
     one, other, both = (up_of_force(part.mean(axis=0)) for part in parts)
     if one is None or other is None or one @ other < np.cos(HALVES):
         return None
-    return None if both is None else Up(both, MOVING)
+    return None if both is None else UpEstimate(both, MOVING)
 
 
 def _rest(

@@ -16,7 +16,7 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame, name_of
 from stereovox.geometry.se3 import Transform
 from stereovox.track.corners import SHARP, flow
-from stereovox.track.fit import Fit, Limits, Stage, settled
+from stereovox.track.fit import Fit, Limits, Stage, solve_stages
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 
@@ -85,7 +85,7 @@ class Pairs:
         self._followed = Sightings(self._camera)
 
     def fit(self, seen: Sight, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose from which the landmarks are seen where they are; `doubt` as in `settled`."""
+        """Return the pose from which the landmarks are seen where they are; `doubt` as in `solve_stages`."""
         self._followed = self._landmarks.follow(seen, expected)
         return _fit(self._followed, expected, doubt)
 
@@ -131,5 +131,5 @@ def _fit(found: Sightings, expected: Transform, doubt: NDArray[np.float64]) -> F
     if len(found) < AGREED:
         return Fit(expected, doubt, 0.0, 0.0)
     stages = [Stage(found.equations(reach), CONVERGED) for reach in REACHES]
-    T, covariance = settled(stages, expected, doubt, found.agreed(expected))  # from there where they agree on none
-    return Fit(T, covariance, len(found) / max(found.sought, 1), found.usual(T))
+    T, covariance = solve_stages(stages, expected, doubt, found.agreed(expected))  # from there where they agree on none
+    return Fit(T, covariance, len(found) / max(found.sought, 1), found.inlier_share(T))

@@ -19,7 +19,7 @@ from stereovox.frame.validate import matrix_of
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
 from stereovox.track.corners import SOFT, WINDOW
-from stereovox.track.fit import RIGID, Equations, Fit, Stage, motion_between, settled
+from stereovox.track.fit import RIGID, Equations, Fit, Stage, motion_between, solve_stages
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
@@ -53,7 +53,7 @@ class Sighted(NamedTuple):
     T_sensor_camera: Transform
 
 
-class Beside(NamedTuple):
+class PhotoLandmarks(NamedTuple):
     """Landmarks that were found in an image beside a depth image, and what they say of the depth camera's pose.
 
     lag: (6, 6) covariance of how the camera may have moved between both images, as that of `Fit`.
@@ -70,19 +70,19 @@ class Beside(NamedTuple):
     def fit(self, expected: Transform, doubt: NDArray[np.float64]) -> Fit | None:
         """Return the pose of the depth camera that most landmarks agree on; None where they agree on none.
 
-        expected, doubt: as those of `settled`.
+        expected, doubt: as those of `solve_stages`.
         """
         agreed = self.found.agreed(expected @ self.T_sensor_camera)
         if agreed is None:
             return None
         stages = [Stage(self.equations(reach), CONVERGED) for reach in REACHES]
-        T, covariance = settled(stages, expected, doubt, agreed @ inverse(self.T_sensor_camera))
-        found = Fit(T, covariance, len(self.found) / max(self.found.sought, 1), self.usual(T))
-        return found if found.usual > MOST else None
+        T, covariance = solve_stages(stages, expected, doubt, agreed @ inverse(self.T_sensor_camera))
+        found = Fit(T, covariance, len(self.found) / max(self.found.sought, 1), self.inlier_share(T))
+        return found if found.inlier_share > MOST else None
 
-    def usual(self, T: Transform) -> float:
+    def inlier_share(self, T: Transform) -> float:
         """Return the share of the landmarks that are where they should be, seen by a depth camera at T."""
-        return self.found.usual(T @ self.T_sensor_camera)
+        return self.found.inlier_share(T @ self.T_sensor_camera)
 
 
 class Photos:
@@ -98,7 +98,7 @@ class Photos:
         self.offered, self.left_out, self.why = 0, 0, ""
         self._landmarks: Landmarks | None = None
         self._last, self._credit = np.eye(4), 0
-        self._followed: Beside | None = None
+        self._followed: PhotoLandmarks | None = None
 
     def forget(self) -> None:
         """Forget all that was learned."""
@@ -134,7 +134,7 @@ class Photos:
         self._credit = max(self._credit, 0)
         return trusted
 
-    def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> Beside | None:
+    def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> PhotoLandmarks | None:
         """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;
         None where they are too few.
         """
@@ -149,7 +149,7 @@ class Photos:
         moved = motion_between(self._last, expected)
         lag = np.repeat([np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])], 3) * LAG
         self._followed = (
-            Beside(found, seen.T_sensor_camera, np.diag(np.square(lag, dtype=np.float64))) if enough else None
+            PhotoLandmarks(found, seen.T_sensor_camera, np.diag(np.square(lag, dtype=np.float64))) if enough else None
         )
         return self._followed
 
@@ -170,13 +170,14 @@ class Photos:
         if seen is not None and self._landmarks is not None:
             self._landmarks.keep(seen.sight, T @ seen.T_sensor_camera)
 
-    def seek(self, seen: Sighted | None) -> list[tuple[Transform, Beside]]:
+    def seek(self, seen: Sighted | None) -> list[tuple[Transform, PhotoLandmarks]]:
         """Return where views were taken that look like an image, and the landmarks that both have in common."""
         self._followed = None
         if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
             return []
         found = [
-            (T, Beside(one, seen.T_sensor_camera, np.zeros((6, 6)))) for T, one in self._landmarks.seek(seen.sight)
+            (T, PhotoLandmarks(one, seen.T_sensor_camera, np.zeros((6, 6))))
+            for T, one in self._landmarks.seek(seen.sight)
         ]
         return [(T @ inverse(seen.T_sensor_camera), one) for T, one in found if len(one.found) >= AGREED]
 

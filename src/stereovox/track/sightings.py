@@ -106,7 +106,7 @@ class Sightings:
         """Return the equations of the pose T_world_camera; reach: squares from which a landmark counts little."""
         return partial(self._equations, reach)
 
-    def usual(self, T: Transform) -> float:
+    def inlier_share(self, T: Transform) -> float:
         """Return the share of the landmarks that are where they should be, seen from T_world_camera."""
         return float(np.mean(self.residuals(T)[0] < USUAL)) if len(self) else 0.0
 

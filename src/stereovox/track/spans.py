@@ -10,7 +10,7 @@ from stereovox.frame import AnyFrame, UpdateReport
 
 
 @dataclass(frozen=True)
-class LostSpan:
+class TrackingGap:
     """Frames in a row whose pose is not known.
 
     Attributes:
@@ -54,7 +54,7 @@ class LostSpans:
     """
 
     def __init__(self, number: int = 0):
-        self.spans: list[LostSpan] = []
+        self.spans: list[TrackingGap] = []
         self.frames, self._number = 0, number
 
     @property
@@ -71,7 +71,7 @@ class LostSpans:
         if self.spans and self.spans[-1].last == number - 1:
             self.spans[-1] = replace(self.spans[-1], last=number, end_ns=stamp_ns)
         else:
-            self.spans.append(LostSpan(number, number, stamp_ns, stamp_ns, why))
+            self.spans.append(TrackingGap(number, number, stamp_ns, stamp_ns, why))
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
         """Take note of a frame that was offered to the map; one with a fault was not tracked."""

@@ -17,8 +17,19 @@ from stereovox.frame import AnyFrame, Frame
 from stereovox.geometry.se3 import Transform
 from stereovox.integrate.views import PerCamera
 from stereovox.sensors.noise import RangeNoise
-from stereovox.track.fit import LOST, Fit, Limits, Stage, both, contrary, deviations, holding, motion_between, settled
-from stereovox.track.photos import Beside, Photos, Sighted, sighted_or_why
+from stereovox.track.fit import (
+    LOST,
+    Fit,
+    Limits,
+    Stage,
+    both,
+    contrary,
+    deviations,
+    holding,
+    motion_between,
+    solve_stages,
+)
+from stereovox.track.photos import PhotoLandmarks, Photos, Sighted, sighted_or_why
 from stereovox.track.surfels import CONVERGED, Elders, Patches, SurfelMap, beside_planes, patches_of
 from stereovox.track.views import (
     View,
@@ -139,7 +150,7 @@ class Surfaces:
         self._photos.forget()
 
     def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`.
+        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `solve_stages`.
 
         The landmarks of an image that was taken along hold it as well.
         """
@@ -149,14 +160,19 @@ class Surfaces:
         return self._fit(patches, beside, expected, doubt, QUIETEST if close else 1.0)
 
     def _fit(
-        self, patches: Patches, beside: Beside | None, expected: Transform, doubt: NDArray[np.float64], quietest: float
+        self,
+        patches: Patches,
+        beside: PhotoLandmarks | None,
+        expected: Transform,
+        doubt: NDArray[np.float64],
+        quietest: float,
     ) -> Fit:
         """Return how patches, and landmarks beside them, fit."""
         levels = self._map.levels(patches, quietest)
         stages = [Stage(level, CONVERGED * level.size) for level in levels]
-        T, covariance = settled(stages, expected, doubt)
+        T, covariance = solve_stages(stages, expected, doubt)
         rough, fine = levels[1].known, levels[2].known
-        alone = Fit(T, covariance, levels[-1].known, levels[-1].usual, min(fine / max(rough, 1e-6), 1.0))
+        alone = Fit(T, covariance, levels[-1].known, levels[-1].inlier_share, min(fine / max(rough, 1e-6), 1.0))
         seen = None if beside is None else beside.fit(expected, doubt)
         if beside is None or seen is None:
             return alone
@@ -168,14 +184,16 @@ class Surfaces:
             return alone
         together = [Stage(both(holding(level, doubt), beside.equations()), CONVERGED * level.size) for level in levels]
         if held and apart:
-            T, covariance = settled(together, expected, doubt, seen.T_map_camera)
+            T, covariance = solve_stages(together, expected, doubt, seen.T_map_camera)
         elif held:
             self._photos.agree(T)
-            T, covariance = settled(together[-1:], expected, doubt, T)
+            T, covariance = solve_stages(together[-1:], expected, doubt, T)
         else:  # the landmarks are right to a part of the finest surfels; coarse ones could only contradict them
-            T, covariance = settled(together[-1:], expected, doubt, seen.T_map_camera)
+            T, covariance = solve_stages(together[-1:], expected, doubt, seen.T_map_camera)
         return alone._replace(
-            T_map_camera=T, covariance=covariance, usual=min(levels[-1].usual, LENIENT * beside.usual(T))
+            T_map_camera=T,
+            covariance=covariance,
+            inlier_share=min(levels[-1].inlier_share, LENIENT * beside.inlier_share(T)),
         )
 
     def _lasting(self, patches: Patches, T: Transform) -> Patches:
@@ -219,7 +237,10 @@ class Surfaces:
         agreed = next((beside for T, beside in common if beside.fit(T, doubt)), None)
         if agreed is None:
             return fits
-        return [fit._replace(usual=min(fit.usual, LENIENT * agreed.usual(fit.T_map_camera))) for fit in fits]
+        return [
+            fit._replace(inlier_share=min(fit.inlier_share, LENIENT * agreed.inlier_share(fit.T_map_camera)))
+            for fit in fits
+        ]
 
     def _roughly(
         self, patches: Patches, here: View, places: list[Transform], doubt: NDArray[np.float64]
@@ -231,9 +252,9 @@ class Surfaces:
         few = patches.thinned(ROUGHLY)
         for place in places:
             levels = self._map.levels(few)[:2]
-            T, _ = settled([Stage(level, ROUGH * level.size) for level in levels], place, doubt)
+            T, _ = solve_stages([Stage(level, ROUGH * level.size) for level in levels], place, doubt)
             through = passed_through(here._replace(T=T), self._views, CHECKED_BY, EVERY)
-            found.append((levels[1].known * levels[1].usual * max(1 - THROUGH * through, 0.0), T))
+            found.append((levels[1].known * levels[1].inlier_share * max(1 - THROUGH * through, 0.0), T))
         for _, T in sorted(found, key=lambda one: -one[0]):
             if len(kept) < CLOSELY and all(far_apart(T, other, SAME_M, SAME_RAD) for other in kept):
                 kept.append(T)

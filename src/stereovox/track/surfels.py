@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stereovox.frame import DepthImage
 from stereovox.geometry.se3 import Transform
 from stereovox.track._surfels import EMPTY, FIELDS, carry, drop, equations, nearest, normals, patches, put
-from stereovox.track.fit import Fit, Stage, settled
+from stereovox.track.fit import Fit, Stage, solve_stages
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -205,8 +205,8 @@ class Elders:
     def fit(self, seen: Patches, T_map_camera: Transform) -> Fit:
         """Return the pose that they ask for, near one; with a wide covariance where they hold none."""
         level = Level(self._surfels, SLACK[ELDER], seen.thinned(SAMPLED), 1.0)
-        T, covariance = settled([Stage(level, CONVERGED * level.size)], T_map_camera, OWN)
-        return Fit(T, covariance, level.known, level.usual)
+        T, covariance = solve_stages([Stage(level, CONVERGED * level.size)], T_map_camera, OWN)
+        return Fit(T, covariance, level.known, level.inlier_share)
 
 
 class Level:
@@ -242,7 +242,7 @@ class Level:
         return len(self.ratios) / max(len(self.seen.points), 1)
 
     @property
-    def usual(self) -> float:
+    def inlier_share(self) -> float:
         """Share of these that agree with it."""
         return float(np.mean(self.ratios < USUAL**2)) if len(self.ratios) else 0.0
 

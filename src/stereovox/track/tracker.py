@@ -67,7 +67,7 @@ class Demand(NamedTuple):
     """Share of an image that must be known, and of that what must be where it is expected."""
 
     known: float
-    usual: float
+    inlier_share: float
 
 
 FOLLOWING, RETURNING, NEARBY, FOUND = Demand(0.2, 0.6), Demand(0.5, 0.8), Demand(0.35, 0.8), Demand(0.75, 0.8)
@@ -107,7 +107,7 @@ class Evidence(Protocol[Seen]):
         ...
 
     def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64], /) -> Fit:
-        """Return how an image fits near an expected pose; `doubt` as in `settled`."""
+        """Return how an image fits near an expected pose; `doubt` as in `solve_stages`."""
         ...
 
     def advance(self, seen: Seen, T: Transform, /) -> None:
@@ -290,7 +290,7 @@ class Tracker:
         believed = fit.known < FOLLOWING.known
         if believed:
             fit = Fit(expected, doubt, fit.known, 1.0)
-        contrary = _doubt(fit, Demand(0.0, FOLLOWING.usual))
+        contrary = _doubt(fit, Demand(0.0, FOLLOWING.inlier_share))
         self._place(expected if contrary else fit.T_map_camera, fit.covariance)
         self._motion, self._trial = motion, 0
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
@@ -391,8 +391,8 @@ class Tracker:
         """Return how long after the last image one comes, by how far apart they usually are; before it: infinity."""
         if stamp_ns < self._stamps[-1]:
             return np.inf
-        usual = self._usual()
-        return (stamp_ns - self._stamps[-1]) / usual if usual else 1.0
+        inlier_share = self._usual()
+        return (stamp_ns - self._stamps[-1]) / inlier_share if inlier_share else 1.0
 
     def _usual(self) -> float:
         """Return how far apart images usually are, in nanoseconds; 0 where that is not known."""
@@ -404,8 +404,8 @@ class Tracker:
         share = 1.0
         if len(self._stamps) > 1 and later > 0 and stamp_ns > self._stamps[-1]:
             last = self._stamps[-1] - self._stamps[-2]
-            usual = (stamp_ns - self._stamps[-1]) / later
-            share = (stamp_ns - self._stamps[-1]) / last if last > SHORTEST * usual else 0.0
+            inlier_share = (stamp_ns - self._stamps[-1]) / later
+            share = (stamp_ns - self._stamps[-1]) / last if last > SHORTEST * inlier_share else 0.0
         spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) > 1 else FIRST)
         return self._T @ interpolate(np.eye(4), self._motion, share), self._covariance + np.diag(spread**2)
 
@@ -421,14 +421,18 @@ class Tracker:
     def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
         """Look for an image among what was seen before."""
         last, reach = self._turned(stamp_ns)
-        fits = sorted(evidence.seek(seen, last), key=lambda fit: -fit.known * fit.usual)
+        fits = sorted(evidence.seek(seen, last), key=lambda fit: -fit.known * fit.inlier_share)
         if not fits:
             return self._lose("not found again: it looks like nothing before")
         if stamp_ns < self._stamps[-1]:
             self._near_ns = -1  # another clock, or a recording that begins again: nobody knows how long it took
         said = [self._refused(evidence, seen, fit, stamp_ns, last, reach) for fit in fits]
         best, why = next(((fit, why) for fit, why in zip(fits, said, strict=True) if not why), (fits[0], said[0]))
-        rivals = [fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual and fit.fine >= FINE]
+        rivals = [
+            fit
+            for fit in fits
+            if fit.known * fit.inlier_share > RIVAL * best.known * best.inlier_share and fit.fine >= FINE
+        ]
         apart = [fit for fit in rivals if far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD)]
         if not why and any(not evidence.contradicted(seen, fit.T_map_camera) for fit in apart):
             why = "it fits at several places"
@@ -520,7 +524,7 @@ def _doubt(fit: Fit, demand: Demand) -> str:
     """Return why a fit is not believed, "" where it is."""
     if fit.known < demand.known:
         return f"{fit.known:.0%} of what it sees is known, {demand.known:.0%} is needed"
-    if fit.usual < demand.usual:
+    if fit.inlier_share < demand.inlier_share:
         return f"{fit.usual:.0%} of what is known lies where it should, {demand.usual:.0%} is needed"
     return ""
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.grids.grid_lattice import Laid, three_states
+from stereovox.evaluate.grids.grid_lattice import AlignedGrids, three_states
 from stereovox.evaluate.grids.grid_scores import Difference, differences, wrong
 from stereovox.maps import State
 from stereovox.view.figures import blank, png_of
@@ -35,7 +35,7 @@ KINDS = {
 """Name and colour; where one pixel stands for several cells, the last of these is shown."""
 
 
-def binary_png(laid: Laid) -> bytes:
+def binary_png(laid: AlignedGrids) -> bytes:
     """Return a PNG with one pixel per cell, north up: white where the maps differ, else black (IST 2019)."""
     from matplotlib.image import imsave
 
@@ -44,7 +44,7 @@ def binary_png(laid: Laid) -> bytes:
     return out.getvalue()
 
 
-def classes(laid: Laid) -> NDArray[np.uint8]:
+def classes(laid: AlignedGrids) -> NDArray[np.uint8]:
     """Return for each cell, (rows, columns) uint8, its `Difference`, or where there is none the common state."""
     found = differences(laid)
     same = np.full(len(State), BOTH_UNKNOWN, np.uint8)
@@ -52,7 +52,7 @@ def classes(laid: Laid) -> NDArray[np.uint8]:
     return np.where(found == Difference.SAME, same[three_states(laid.reference)], found)
 
 
-def difference_png(laid: Laid) -> bytes:
+def difference_png(laid: AlignedGrids) -> bytes:
     """Return a PNG with the kinds of difference in colours, in metres of the reference's frame."""
     box = _box(laid)
     figure, (axis,) = _panels(box, 1)
@@ -63,7 +63,7 @@ def difference_png(laid: Laid) -> bytes:
     return png_of(figure, DPI)
 
 
-def side_by_side_png(laid: Laid, names: tuple[str, str] = ("Reference", "Map")) -> bytes:
+def side_by_side_png(laid: AlignedGrids, names: tuple[str, str] = ("Reference", "Map")) -> bytes:
     """Return a PNG of the reference, the map, and the binary difference (white: an error), all in one frame."""
     box = _box(laid)
     figure, panels = _panels(box, 3)
@@ -78,7 +78,7 @@ def side_by_side_png(laid: Laid, names: tuple[str, str] = ("Reference", "Map")) 
     return png_of(figure, DPI)
 
 
-def _box(laid: Laid) -> Box:
+def _box(laid: AlignedGrids) -> Box:
     """Return the box of all cells known to either map."""
     box = bounds(replace(laid.reference, cells=np.maximum(laid.map.cells, laid.reference.cells)))
     return box if box is not None else (np.zeros(2), np.ones(2))

@@ -18,7 +18,7 @@ from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.mapping.comparison import Comparison
 from stereovox.mapping.deadline import full_quality
-from stereovox.mapping.gate import Gate, Passed
+from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import State, VoxelMap, make_map
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, SIDE
@@ -66,7 +66,7 @@ class Trial:
             image, evidence, passed = self._offer(frame)
         except FrameRefused as refused:
             return refused.reason
-        self.map.storage.look_from(image.viewpoint)
+        self.map.storage.set_viewpoint(image.viewpoint)
         self.map.add(evidence)
         self.map.history.frames += 1
         self._gate.accept(passed)
@@ -84,7 +84,7 @@ class Trial:
             history.doubts, history.waiting = doubts, waiting
         return self._effect(evidence, self.quality.integrator.evidence(self._image(true)))
 
-    def _offer(self, frame: AnyFrame) -> tuple[DepthImage, Evidence, Passed]:
+    def _offer(self, frame: AnyFrame) -> tuple[DepthImage, Evidence, GateResult]:
         image = self._image(frame)
         passed = self._gate.check(frame, image)
         evidence = self.quality.integrator.evidence(image)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.level_ways import LevelWays
+from stereovox.products.floor.level_ways import LevelPlanner
 from stereovox.products.frontiers import Frontier, frontiers
 from stereovox.products.path_check import check_path, point_along
 from stereovox_lab.flights.air import Air
@@ -90,7 +90,7 @@ class Mission(Protocol):
 
     left: dict[str, int]
 
-    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return a way (N, 3) and the place (3,) to look at from its end, NaN to look all round; None: it is done."""
         ...
 
@@ -103,13 +103,13 @@ class MiddleOfRoom:
         self.room_m = 0.0
         self.left: dict[str, int] = {}
 
-    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the way to the middle as it is known by now."""
         found = ways.middle()
         if found is None or not self._looks_left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
             return None
         (self._last, self.room_m), self._looks_left = found, self._looks_left - 1
-        way = ways.way_to(self._last)
+        way = ways.path_to(self._last)
         return None if way is None else (way, np.full(3, np.nan))
 
 
@@ -124,7 +124,7 @@ class Frontiers:
         self._in_vain = 0
         self.left: dict[str, int] = {}
 
-    def next(self, voxel_map: VoxelMap, ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the way to where the nearest frontier is seen from, or to where it looks all round."""
         self._rounds = self._rounds or [ways.start]  # where it began it turned once
         height = ways.start[2]
@@ -159,31 +159,33 @@ class Frontiers:
         return any(same) or len(same) >= TRIES
 
     def _nearest(
-        self, found: list[Frontier], ways: LevelWays, near: float
+        self, found: list[Frontier], ways: LevelPlanner, near: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the shortest way to `near` metres from where one of the frontiers is seen from, and its middle."""
         best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         for one in found:
-            way = None if one.look_from is None else ways.way_to(one.look_from, near)
+            way = None if one.look_from is None else ways.path_to(one.look_from, near)
             if way is None or self._is_done(one.centroid, way[-1]):
                 continue
             if best is None or _length(way) < _length(best[0]):
                 best = way, one.centroid
         return best
 
-    def _round(self, found: list[Frontier], ways: LevelWays) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def _round(
+        self, found: list[Frontier], ways: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the way to look all round from as near to one of the frontiers as it can come, the largest first."""
         for one in found:
-            way = ways.way_to(one.centroid, inf)
+            way = ways.path_to(one.centroid, inf)
             if way is not None and all(np.linalg.norm((way[-1] - place)[:2]) > ROUND_M for place in self._rounds):
                 self._rounds.append(way[-1])
                 return way, np.full(3, np.nan)
         return None
 
-    def _why_left(self, found: list[Frontier], ways: LevelWays) -> dict[str, int]:
+    def _why_left(self, found: list[Frontier], ways: LevelPlanner) -> dict[str, int]:
         """Count the frontiers that are left, by why none of them is a goal."""
         why = [
-            UNSEEN if one.look_from is None else NO_WAY if ways.way_to(one.look_from, SHORT_M) is None else LOOKED_AT
+            UNSEEN if one.look_from is None else NO_WAY if ways.path_to(one.look_from, SHORT_M) is None else LOOKED_AT
             for one in found
         ]
         return {reason: why.count(reason) for reason in (UNSEEN, NO_WAY, LOOKED_AT)}
@@ -312,7 +314,7 @@ class _Mission:
         """Choose the next way; return whether there is one."""
         cruise = self._cruise
         here = np.array([*self._quad.position[:2], self._height])
-        ways = LevelWays(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
+        ways = LevelPlanner(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
         found = self._mission.next(self._mapper.map, ways)
         if found is None:
             return False

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.correct.loops.closer import difference
-from stereovox.correct.loops.drift import Drift, Way
+from stereovox.correct.loops.drift import Drift, PathLength
 from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.simulate.simulation import Simulation
 
@@ -18,7 +18,7 @@ def test_a_drifting_tracker_is_as_far_off_as_drift_allows(share):
         first, last = 5, len(walk) - 1
         exact = inverse(walk.true_pose(first)) @ walk.true_pose(last)
         off = difference(exact, inverse(walk.pose(first)) @ walk.pose(last))
-        way = Way()
+        way = PathLength()
         lengths = [way.add("", walk.pose(i)) for i in range(first, last + 1, 5)]
         covariance = drift.covariance(*lengths[-1])
         squared.append(off[3:] @ np.linalg.solve(covariance[3:, 3:], off[3:]) / 3)
@@ -34,7 +34,7 @@ def test_covariance_grows_with_the_way():
 
 
 def test_the_way_of_a_rig_is_that_of_its_body():
-    alone, together, T_front_rear = Way(), Way(), np.eye(4)
+    alone, together, T_front_rear = PathLength(), PathLength(), np.eye(4)
     T_front_rear[:3, :3], T_front_rear[:3, 3] = rotation_matrix([0, np.pi, 0]), [0.2, 0, -0.3]
     for x in np.linspace(0, 3, 31):
         pose = np.eye(4)
@@ -45,7 +45,7 @@ def test_the_way_of_a_rig_is_that_of_its_body():
 
 
 def test_a_sensor_that_begins_late_goes_on_with_the_way():
-    way, pose = Way(), np.eye(4)
+    way, pose = PathLength(), np.eye(4)
     way.add("front", pose)
     pose = pose.copy()
     pose[:3, :3], pose[0, 3] = rotation_matrix([0, 0, 0.5]), 2.0

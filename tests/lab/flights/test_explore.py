@@ -48,7 +48,7 @@ class Straight:
     def __init__(self, x: float, short: float = 0.0):
         self.start, self.short = np.array([x, 0, 1.0]), short
 
-    def way_to(self, goal, near):
+    def path_to(self, goal, near):
         end = np.asarray(goal) - np.array([self.short, 0, 0])
         return np.stack([self.start, end]) if self.short <= near else None
 

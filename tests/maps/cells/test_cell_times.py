@@ -164,15 +164,15 @@ def test_cells_on_disk_are_forgotten_wherever_they_are_asked_for(tmp_path):
     made.fly(one, [(made.at((0, 0, 0), 0), one_cell(9000)), (made.at((30, 0, 0), SECOND), one_cell(0))])
     assert one.state(place)[0] == State.OCCUPIED
     one.save(tmp_path / "early")
-    one.storage.look_from(made.at((30, 0, 0), 11 * SECOND))
+    one.storage.set_viewpoint(made.at((30, 0, 0), 11 * SECOND))
     assert one.state(place)[0] == State.UNKNOWN
     assert one.counts()["occupied"] == 0
     one.save(tmp_path / "late")
     assert load_map(tmp_path / "early").counts()["occupied"] == 1
     assert load_map(tmp_path / "late").counts()["occupied"] == 0
-    one.storage.look_from(made.at((0, 0, 0), 11 * SECOND))
+    one.storage.set_viewpoint(made.at((0, 0, 0), 11 * SECOND))
     assert len(one.storage._pool) == len(one.storage._times) == 0
-    one.storage.look_from(made.at((30, 0, 0), 2 * SECOND))  # not even where the clock goes back
+    one.storage.set_viewpoint(made.at((30, 0, 0), 2 * SECOND))  # not even where the clock goes back
     assert one.state(place)[0] == State.UNKNOWN
     one.close()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["early", "late"]
@@ -184,7 +184,7 @@ def test_what_was_over_on_disk_stays_so_when_the_clock_is_set_back(tmp_path, clo
     config = settings(**WINDOW, **{"window.outside": "keep", "map.forget_s": 5.0})
     one = made.fly(make_map(config), [made.Moment(made.at((0, 0, 0), 10 * SECOND), one_cell(3000))])
     for n, place in enumerate((20, 20, 20, 0)):
-        one.storage.look_from(made.at((place, 0, 0), round(clock[n] * SECOND)))
+        one.storage.set_viewpoint(made.at((place, 0, 0), round(clock[n] * SECOND)))
         assert (one.state([[0.05, 0.05, 0.05]]) == State.UNKNOWN) == (n > 0), n
         if saved:
             one.save(tmp_path / "m")

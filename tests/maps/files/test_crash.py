@@ -257,7 +257,7 @@ def test_no_room_for_a_tile_loses_no_cell(tmp_path):
         told = []
         for x in (0.0, 10.0, 20.0, 30.0, 40.0):
             try:
-                rolling.storage.look_from(at(x))
+                rolling.storage.set_viewpoint(at(x))
             except MapFileError as error:
                 told.append(str(error))
             rolling.storage.tile_store._writer.submit(lambda: None).result()  # all that waited was tried
@@ -278,11 +278,11 @@ def test_what_a_killed_run_left_of_its_tiles_goes_with_the_next(tmp_path, again)
 
     def killed_run():
         rolling = make_map(config, tiles=tmp_path / "tiles")
-        rolling.storage.look_from(at(0.0))
+        rolling.storage.set_viewpoint(at(0.0))
         rolling.storage.insert(*small_map(9).storage.blocks())
         coords = small_map(9).storage.blocks()[0]
         rolling.storage.set_times(coords, np.full((len(coords), 512), 1 << 30, np.uint32), 0)
-        rolling.storage.look_from(at(10.0))
+        rolling.storage.set_viewpoint(at(10.0))
         for tiles in (rolling.storage._store, rolling.storage._times_store):
             tiles._writer.submit(lambda: None).result()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -303,16 +303,16 @@ def test_what_a_killed_run_left_of_its_tiles_goes_with_the_next(tmp_path, again)
 def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, stopped):
     config = load_config(voxel_size=0.1, window={"size": [3.2, 3.2, 3.2], "outside": "keep"}, map={"keep_times": True})
     rolling = make_map(config, tiles=tmp_path / "tiles")
-    rolling.storage.look_from(at(0.0))
+    rolling.storage.set_viewpoint(at(0.0))
     coords, cells = small_map(3).storage.blocks()
     rolling.storage.insert(coords - np.array([2, 0, 0], np.int32), cells)  # in two tiles
     monkeypatch.setattr(getattr(rolling.storage, stopped), "_write", lambda *_: no_room())
     monkeypatch.setattr("stereovox.maps.storage.tiles.WAITING", 1)  # nobody waits for what cannot be written
-    rolling.storage.look_from(at(10.0))
+    rolling.storage.set_viewpoint(at(10.0))
     for tiles in (rolling.storage._store, rolling.storage._times_store):
         tiles._writer.submit(lambda: None).result()
     with pytest.raises(MapFileError, match="a tile cannot be written"):
-        rolling.storage.look_from(at(20.0))
+        rolling.storage.set_viewpoint(at(20.0))
     rolling.close()
     assert names(tmp_path) == []
 

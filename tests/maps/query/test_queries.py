@@ -394,14 +394,14 @@ def test_a_window_knows_points_on_disk_and_the_rest_of_what_is_in_memory(tmp_pat
     config = load_config(voxel_size=0.1, window={"size": [3.2, 3.2, 3.2], "outside": "keep"})
     solid = np.full((1, 512), 5000, np.int16)
     rolling = make_map(config, tiles=tmp_path / "tiles")
-    rolling.storage.look_from(Viewpoint(CAMERA, np.eye(4), 0))
+    rolling.storage.set_viewpoint(Viewpoint(CAMERA, np.eye(4), 0))
     rolling.add(Evidence(np.zeros((1, 3), np.int32), solid, np.empty((0, 3), np.int32), -1))
     inside, ball = [[0.05, 0.05, 0.05]], ([[0.4] * 3], [[0.4] * 3], 0.1)
     assert rolling.state(inside).tolist() == [OCCUPIED]
     assert rolling.check_capsules(*ball).tolist() == [OCCUPIED]
     away = np.eye(4)
     away[:3, 3] = 50
-    rolling.storage.look_from(Viewpoint(CAMERA, away, 1))
+    rolling.storage.set_viewpoint(Viewpoint(CAMERA, away, 1))
     assert rolling.state(np.array(inside, np.float32)).tolist() == [OCCUPIED]
     assert rolling.check_capsules(*ball).tolist() == [UNKNOWN]
     assert rolling.check_boxes(inside, inside).tolist() == [UNKNOWN]

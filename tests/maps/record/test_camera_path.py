@@ -7,12 +7,12 @@ import numpy as np
 
 import stereovox as sv
 from stereovox.geometry.se3 import look_at
-from stereovox.maps.record.camera_path import MAX_STOPS, SPACING_M, CameraPath, Seen
+from stereovox.maps.record.camera_path import MAX_STOPS, SPACING_M, CameraPath, StampedPose
 
 
 def seen(n, x, turn=0.0):
     c, s = np.cos(turn), np.sin(turn)
-    return Seen(n, (c, -s, 0.0, x, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+    return StampedPose(n, (c, -s, 0.0, x, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
 
 
 def xs(path, sensor="camera"):

@@ -4,16 +4,16 @@
 import numpy as np
 
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 from stereovox.maps.record.corrected import correct_history, matrix_of
-from stereovox.maps.record.history import Doubt, History, Look, Streak
+from stereovox.maps.record.history import DisagreementSpell, History, ImageFingerprint, Streak
 from stereovox.maps.record.loop_lines import LoopLines
 
 
 def seen(stamp_ns, x, turn=0.0):
     T = np.eye(4)
     T[:3, :3], T[0, 3] = rotation_matrix([0, 0, turn]), x
-    return Seen(stamp_ns, tuple(T.ravel().tolist()[:12]))
+    return StampedPose(stamp_ns, tuple(T.ravel().tolist()[:12]))
 
 
 def history_of(left, right):
@@ -21,8 +21,8 @@ def history_of(left, right):
         frames=4,
         trusted={"left": left, "right": right},
         waiting={"left": Streak("pose_jump", 5, seen(6, 9.0)), "right": Streak("pose_jump", 5, seen(6, 9.0))},
-        looks={"left": Look(7, seen(0, 0.5).pose), "right": Look(8, seen(0, 0.5).pose)},
-        doubts={"left": Doubt(1, 2), "right": Doubt(1, 2)},
+        looks={"left": ImageFingerprint(7, seen(0, 0.5).pose), "right": ImageFingerprint(8, seen(0, 0.5).pose)},
+        doubts={"left": DisagreementSpell(1, 2), "right": DisagreementSpell(1, 2)},
     )
 
 
@@ -36,8 +36,8 @@ def test_a_sensor_that_moved_is_remembered_where_it_is_now():
     assert history.trusted == {"left": after[2][1], "right": before[3][1]}
     assert list(history.waiting) == list(history.doubts) == ["right"]
     moved = matrix_of(after[2][1]) @ np.linalg.inv(matrix_of(before[2][1])) @ matrix_of(seen(0, 0.5))
-    assert np.allclose(matrix_of(Seen(0, history.looks["left"].pose)), moved)
-    assert history.looks["right"] == Look(8, seen(0, 0.5).pose)
+    assert np.allclose(matrix_of(StampedPose(0, history.looks["left"].pose)), moved)
+    assert history.looks["right"] == ImageFingerprint(8, seen(0, 0.5).pose)
     assert np.allclose(history.path.poses("left")[:, 0, 3], [0.0, 2.3])
     assert np.allclose(history.path.poses("right")[:, 0, 3], [1.0, 1.3])
 

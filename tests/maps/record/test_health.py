@@ -116,7 +116,7 @@ def test_frames_looked_at_less_thoroughly_degrade_the_map(monkeypatch):
     health = mapper.health()
     assert (health.state, health.reduced) == ("degraded", {"near": 1})
     assert "1 of 2 frames mapped at reduced quality (1 x near)" in health.text
-    assert mapper.map.history.ways == {"full": 1, "near": 1}
+    assert mapper.map.history.quality == {"full": 1, "near": 1}
 
 
 def test_the_frame_counts_from_when_it_came_not_from_when_it_was_done(monkeypatch):

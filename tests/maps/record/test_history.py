@@ -11,7 +11,7 @@ from made_manifest import manifest_in, put_manifest
 import stereovox as sv
 from stereovox.errors import MapFileError
 from stereovox.maps.record.camera_path import CameraPath
-from stereovox.maps.record.history import MAX_REASONS, OTHERS, History, Seen, Streak
+from stereovox.maps.record.history import MAX_REASONS, OTHERS, History, StampedPose, Streak
 from stereovox.maps.record.loop_lines import LoopLines
 
 POSE = tuple(float(x) / 3 for x in range(12))
@@ -22,9 +22,9 @@ FULL = History(
     Counter({"full": 6, "near": 1}),
     "kitchen",
     ("frame 9", 2**62),
-    {"left": Seen(2**62, POSE), "right": Seen(-5, POSE)},
-    {"left": Streak("pose_jump", 2**62 + 1, Seen(2**62 + 9, POSE))},
-    CameraPath(0.1, {"left": [Seen(2**62, (0.5,) * 12)], "right": []}),
+    {"left": StampedPose(2**62, POSE), "right": StampedPose(-5, POSE)},
+    {"left": Streak("pose_jump", 2**62 + 1, StampedPose(2**62 + 9, POSE))},
+    CameraPath(0.1, {"left": [StampedPose(2**62, (0.5,) * 12)], "right": []}),
     loops=LoopLines.between([[[0, 0, 0], [1, 2, 3]]], []),
     recordings=2,
 )
@@ -150,7 +150,7 @@ def test_info_tells_it(saved_map, capsys):
     assert (told["frames"], told["frames_refused"], told["recording"]) == (7, 3, "kitchen")
     assert told["refused"] == {"no_pose": 2, "pose_jump": 1}
     assert told["settled"] == {"clock_reset": 1}
-    assert told["ways"] == {"full": 6, "near": 1}
+    assert told["quality"] == {"full": 6, "near": 1}
     assert told["loops"] == {"closed": 1, "refused": 0}
     assert told["last_stamps_ns"] == {"left": 2**62, "right": -5}
     assert main(["info", str(saved_map)]) == 0

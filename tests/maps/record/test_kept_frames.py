@@ -17,7 +17,7 @@ from stereovox.cameras.pinhole import DepthCorrection
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.maps.cells import _packing
 from stereovox.maps.record import frame_store
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 from stereovox.maps.record.kept_frames import KeptFrame, KeptFrames, Packed
 
 CAMERA = sv.PinholeCamera(12, 9, 10.0, 10.0, 5.5, 4.0, 0.05)
@@ -30,7 +30,7 @@ def kept(number, x=0.0, sensor="camera", size=(9, 12), camera=CAMERA):
     T = LOOKS_AHEAD.copy()
     T[0, 3] = x
     frame = sv.Frame(depth, camera, T, number, 0.001, name=f"frame {number}", sensor=sensor)
-    seen = Seen(number, tuple(T.ravel().tolist()[:12]))
+    seen = StampedPose(number, tuple(T.ravel().tolist()[:12]))
     blocks = np.array([[0, 0, 0], [1, 2, 3]], np.int32)
     return KeptFrame(
         number, sensor, frame.name, number, T, camera, "full", (0.0, 0.0), 0.001, np.inf, Packed.of(frame), seen, blocks

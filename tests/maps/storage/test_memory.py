@@ -105,7 +105,7 @@ def test_a_window_takes_what_there_is_and_no_more(when_full, outside, times):
     one = make_map(settings("200 MB", when_full=when_full, **times))
     assert 0.6 * 200e6 < one.reserved_bytes <= 200e6
     assert one.storage._settings.window.outside == outside
-    one.storage.look_from(made.at((3, 3, 3)))
+    one.storage.set_viewpoint(made.at((3, 3, 3)))
     wide, deep, high = np.diff(one.window, axis=0)[0]
     assert wide == deep >= 2 * (5.0 + 1.0)
     assert high >= 5.0 + 2 * 1.0

@@ -48,7 +48,7 @@ class Slow:
         self.config, self.cells, self.middle = config, {}, None
         self.n = np.round(np.array(config.window.size) / config.voxel_size).astype(int)
 
-    def look_from(self, position):
+    def set_viewpoint(self, position):
         position = np.asarray(position, float)
         if self.middle is None:
             self.middle = np.round(position / 0.1).astype(int)
@@ -84,8 +84,8 @@ def test_equals_a_dictionary(outside, uniform):
     fast, slow = make_map(config), Slow(config)
     random = np.random.default_rng(1)
     for position in PATH:
-        fast.storage.look_from(at(position))
-        slow.look_from(position)
+        fast.storage.set_viewpoint(at(position))
+        slow.set_viewpoint(position)
         evidence = evidence_about(random, position, uniform=uniform)
         slow.add(evidence)
         fast.add(evidence)
@@ -107,7 +107,7 @@ def test_keep_equals_an_unbounded_map_where_the_window_holds_all_evidence(tmp_pa
     for x in [*way, *way[::-1]]:
         evidence = evidence_about(random, (x, x / 7, 0), uniform=-1800)
         for one in (rolling, unbounded):
-            one.storage.look_from(at((x, x / 7, 0)))
+            one.storage.set_viewpoint(at((x, x / 7, 0)))
             one.add(evidence)
     assert len(rolling.storage.tile_store.tiles()) > 20
     for a, b in zip(rolling.storage.blocks(), unbounded.storage.blocks(), strict=True):
@@ -130,7 +130,7 @@ def test_a_saved_rolling_map_goes_on(tmp_path):
             half.save(tmp_path / "half")
             half = make_map(config, load_map(tmp_path / "half"))
         for one in (whole, half):
-            one.storage.look_from(at((x, 0, 0)))
+            one.storage.set_viewpoint(at((x, 0, 0)))
             one.add(evidence)
     for a, b in zip(whole.storage.blocks(), half.storage.blocks(), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -141,7 +141,7 @@ def test_resuming_a_dropping_map_takes_over_only_the_window(tmp_path):
     old = VoxelMap.from_cells(config, [[0, 0, 0], [16, 0, 0], [17, 0, 0], [18, 0, 0], [900, 0, 0]], [1, 1, 1, 1, 1])
     old.save(tmp_path / "old")
     new = make_map(config, load_map(tmp_path / "old"))
-    new.storage.look_from(at((0, 0, 0)))
+    new.storage.set_viewpoint(at((0, 0, 0)))
     assert new.cells()[0][:, 0].tolist() == [0, 16]  # 33 cells: -16 to 16
 
 
@@ -151,19 +151,19 @@ def test_memory_is_constant_and_bounded():
     before = rolling.memory_bytes
     random = np.random.default_rng(4)
     for x in np.linspace(0, 50, 80):
-        rolling.storage.look_from(at((x, 0, 0)))
+        rolling.storage.set_viewpoint(at((x, 0, 0)))
         rolling.add(evidence_about(random, (x, 0, 0)))
     assert rolling.memory_bytes == rolling.reserved_bytes == before < 100 * 1100 * 2
 
 
 def test_a_block_on_the_border_goes_with_its_last_known_cell():
     rolling = make_map(settings())
-    rolling.storage.look_from(at((0, 0, 0)))  # the window begins at cell -16
+    rolling.storage.set_viewpoint(at((0, 0, 0)))  # the window begins at cell -16
     values = np.zeros((1, 512), np.int16)
     values[0, 0] = 500
     rolling.add(Evidence(np.array([[-2, 0, 0]], np.int32), values, np.empty((0, 3), np.int32), 0))
     assert rolling.cells()[0].tolist() == [[-16, 0, 0]]
-    rolling.storage.look_from(at((0.36, 0, 0)))  # now at -15: half of the block is still in it
+    rolling.storage.set_viewpoint(at((0.36, 0, 0)))  # now at -15: half of the block is still in it
     assert len(rolling.storage.blocks()[0]) == 0
 
 
@@ -172,7 +172,7 @@ def test_bytes_roll_like_thousandths():
     rolling = make_map(config)
     random = np.random.default_rng(5)
     for x in [0, 1, 2, 30, 0]:
-        rolling.storage.look_from(at((x, 0, 0)))
+        rolling.storage.set_viewpoint(at((x, 0, 0)))
         rolling.add(evidence_about(random, (x, 0, 0)))
     assert rolling.storage.blocks()[1].dtype == np.uint8
     low, high = rolling.window
@@ -293,7 +293,7 @@ def test_a_fixed_box_stays_and_takes_only_what_lies_in_it():
     for x in (0.0, 30.0, -7.0):
         T = np.eye(4)
         T[0, 3] = x
-        voxel_map.storage.look_from(Viewpoint(PinholeCamera.from_field_of_view(64, 48, 90), T, int(1e9 * abs(x))))
+        voxel_map.storage.set_viewpoint(Viewpoint(PinholeCamera.from_field_of_view(64, 48, 90), T, int(1e9 * abs(x))))
         voxel_map.add(Evidence(coords, np.full((len(coords), 512), 3000, np.int16), np.empty((0, 3), np.int32), 0))
         np.testing.assert_allclose(voxel_map.window, [[-1, -1, -0.5], [3, 1, 0.5]])
     cells, _ = voxel_map.cells()

@@ -45,7 +45,7 @@ def moved(folder, outside):
     one = make_map(settings(outside=outside, lead_s=1.0))
     one.storage.go_on_with(an_earlier_map().storage)
     for i in range(5):
-        one.storage.look_from(at(0.3 * i, 100_000_000 * i))
+        one.storage.set_viewpoint(at(0.3 * i, 100_000_000 * i))
     one.frames = 5
     one.save(folder)
     one.close()
@@ -85,7 +85,7 @@ def test_another_window_is_placed_anew_and_the_old_place_forgotten(tmp_path):
     assert again.storage.window_state is None  # or it would be taken for a place of the wider window
     same(again, first)
     third = make_map(wider, again)
-    third.storage.look_from(at(20.0))
+    third.storage.set_viewpoint(at(20.0))
     np.testing.assert_allclose(np.diff(third.window, axis=0), [[4.8, 3.2, 3.2]])
     third.close()
 
@@ -93,7 +93,7 @@ def test_another_window_is_placed_anew_and_the_old_place_forgotten(tmp_path):
 def test_cells_in_tiles_are_found_like_all_others():
     rolling = make_map(settings(outside="keep"), an_earlier_map())
     for x in (0.0, 25.0, 1.0, 25.0):  # out and back: a tile on disk that the window touches is out of date
-        rolling.storage.look_from(at(x))
+        rolling.storage.set_viewpoint(at(x))
         whole = an_earlier_map()
         random = np.random.default_rng(0)
         points = np.concatenate(
@@ -110,8 +110,8 @@ def test_cells_in_tiles_are_found_like_all_others():
 
 def test_a_cell_that_changed_since_its_tile_came_back_is_told_as_it_is_now():
     rolling = make_map(settings(outside="keep"), an_earlier_map())
-    rolling.storage.look_from(at(25.0))
-    rolling.storage.look_from(at(0.0))
+    rolling.storage.set_viewpoint(at(25.0))
+    rolling.storage.set_viewpoint(at(0.0))
     rolling.storage.insert(np.zeros((1, 3), np.int32), np.zeros((1, 512), np.int16))
     assert rolling.state(rolling.centers([[0, 0, 0]]))[0] == State.UNKNOWN
     rolling.close()
@@ -122,7 +122,7 @@ def test_a_rolling_map_goes_on_without_a_window(placed):
     rolling = make_map(settings(outside="keep"), an_earlier_map())
     rolling.frames, rolling.recording = 7, "kitchen"
     if placed:
-        rolling.storage.look_from(at(25.0))
+        rolling.storage.set_viewpoint(at(25.0))
     mapper = Mapper("default", voxel_size=0.1, resume=rolling)
     assert type(mapper.map) is VoxelMap
     assert (mapper.map.frames, mapper.map.recording, mapper.map.config.window.size) == (7, "kitchen", None)

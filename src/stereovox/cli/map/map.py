@@ -164,7 +164,7 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
         say(f"note: {mapped.imu}")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
-    if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:
+    if reduced := [f"{number} {quality}" for quality, number in result["quality"].items() if quality != FULL]:
         say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"per pair: {result['match_ms']['median']:.3g} ms to match it (median)")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.lidar import Lidar
 from stereovox.config import Config
-from stereovox.correct.loops.drift import GATE, Drift, Way, difference, squared
+from stereovox.correct.loops.drift import GATE, Drift, PathLength, difference, squared
 from stereovox.correct.loops.matching import FLOOR, Match, matched
 from stereovox.correct.loops.odometry import Odometry
 from stereovox.correct.loops.positions import Positions
@@ -114,7 +114,7 @@ class LoopCloser:
         self._steps, self._overlaps, self._uprights = list[Edge](), list[Edge](), list[Upright]()
         self._waiting: list[Loop] = []  # for another one that agrees
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
-        self._ways, self._way = list[tuple[float, float]](), Way()
+        self._ways, self._way = list[tuple[float, float]](), PathLength()
 
     @property
     def places(self) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ class Drift(NamedTuple):
         return self.share * float(np.sqrt(KEEPS_M * metres))
 
 
-class Way:
+class PathLength:
     """The way of a body so far, by the frames of all its sensors.
 
     From one sensor to the next there is no way: each goes on from its own last frame.

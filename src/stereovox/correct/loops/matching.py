@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.correct.loops.submaps import Shape
 from stereovox.geometry.se3 import Transform, inverse
-from stereovox.track.fit import Stage, deviations, motion_between, settled
+from stereovox.track.fit import Stage, deviations, motion_between, solve_stages
 from stereovox.track.surfels import CONVERGED, Level, Patches, SurfelMap
 from stereovox.track.views import View, contradiction
 
@@ -86,12 +86,12 @@ def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | Non
             if level is middle and not _is_one_place(middle):
                 return  # the finer ones, which take longest, would be for nothing
 
-    T, covariance = settled(stages(), guess, DOUBT)
+    T, covariance = solve_stages(stages(), guess, DOUBT)
     return _Laid(T, covariance, middle.known) if _is_one_place(middle) else None
 
 
 def _is_one_place(level: Level) -> bool:
-    return level.known >= SHARED and level.usual >= USUAL
+    return level.known >= SHARED and level.inlier_share >= USUAL
 
 
 def _looked_through(earlier: list[View], later: list[View], T: Transform) -> float:

@@ -25,7 +25,7 @@ Rectangle = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Laid:
+class AlignedGrids:
     """A map laid on a reference: both on the cells of the reference, in the reference's map frame.
 
     map, reference: cover all cells known to either, at least one.
@@ -39,9 +39,9 @@ class Laid:
     motion: se2.Pose
 
 
-def lay(
+def aligned_grids(
     grid: OccupancyGrid, reference: OccupancyGrid, motion: ArrayLike = (0, 0, 0), exclude: Iterable[Rectangle] = ()
-) -> Laid:
+) -> AlignedGrids:
     """Lay `grid` on the cells of `reference`, moved by `motion`: (3,) pose_reference_map of the two map frames.
 
     A cell takes the value at its centre; an occupied cell of the map that holds no such centre (a coarser reference, a
@@ -63,7 +63,7 @@ def lay(
     pose_target_map = se2.compose(se2.inverse(offset), pose)
     source = replace(target, cells=resampled(grid, pose_target_map, target))
     source = replace(source, free_below=grid.free_below, occupied_above=grid.occupied_above)
-    return Laid(source, target, excluded_cells(target, exclude), motion)
+    return AlignedGrids(source, target, excluded_cells(target, exclude), motion)
 
 
 def three_states(grid: OccupancyGrid) -> NDArray[np.uint8]:

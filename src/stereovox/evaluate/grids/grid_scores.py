@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.grids.grid_align import align_grids
-from stereovox.evaluate.grids.grid_lattice import EMPTY_REFERENCE, Laid, Rectangle, lay, three_states
+from stereovox.evaluate.grids.grid_lattice import EMPTY_REFERENCE, AlignedGrids, Rectangle, aligned_grids, three_states
 from stereovox.evaluate.metrics import Confusion, ratio
 from stereovox.evaluate.reliability import brier, correlation
 from stereovox.geometry import se2
@@ -45,7 +45,7 @@ class Difference(IntEnum):
     FORGIVEN = 5
 
 
-def differences(laid: Laid) -> NDArray[np.uint8]:
+def differences(laid: AlignedGrids) -> NDArray[np.uint8]:
     """Return `Difference` of each cell, (rows, columns) uint8."""
     table = np.full((4, 4), Difference.SAME, np.uint8)
     for known in (State.FREE, State.OCCUPIED):
@@ -94,7 +94,7 @@ class CellErrors:
     known_in_both: int
 
 
-def cell_errors(laid: Laid, found: NDArray[np.uint8]) -> CellErrors:
+def cell_errors(laid: AlignedGrids, found: NDArray[np.uint8]) -> CellErrors:
     """Count the result of `differences`. Raises StereovoxError for a reference without any known cell."""
     here, there = three_states(laid.map), three_states(laid.reference)
     missed, occupied, free, extra, forgiven = np.bincount(found.ravel(), minlength=len(Difference))[1:].tolist()
@@ -300,12 +300,12 @@ def laid_on(
     exclude: Iterable[Rectangle] = (),
     align: bool = True,
     start: ArrayLike = (0, 0, 0),
-) -> Laid:
+) -> AlignedGrids:
     """Return both maps on the reference's cells, aligned or moved by `start`; see `score_grids`."""
-    return lay(grid, reference, align_grids(grid, reference, start) if align else start, exclude)
+    return aligned_grids(grid, reference, align_grids(grid, reference, start) if align else start, exclude)
 
 
-def score_laid(laid: Laid, map_resolution: float, aligned: bool, tolerance: int = 1) -> GridScores:
+def score_laid(laid: AlignedGrids, map_resolution: float, aligned: bool, tolerance: int = 1) -> GridScores:
     """Score two maps on the same cells."""
     if not 0 <= tolerance <= 1000:
         raise StereovoxError(f"tolerance {tolerance}: give the cells that are forgiven, 0 to 1000")

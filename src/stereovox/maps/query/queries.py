@@ -27,7 +27,7 @@ BADNESS = (State.FREE, State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
 """States from best to worst for a planner."""
 
 
-class Asked(NamedTuple):
+class QueryTarget(NamedTuple):
     """A map as queries read it: its cells, what their numbers mean, and their sides in metres."""
 
     cells: StoredCells
@@ -103,7 +103,7 @@ def stored_at(
 
 
 def cast_rays(
-    asked: Asked, origins: ArrayLike, directions: ArrayLike, max_distance: float, stop_at: Iterable[State]
+    asked: QueryTarget, origins: ArrayLike, directions: ArrayLike, max_distance: float, stop_at: Iterable[State]
 ) -> RayHits:
     """Return where rays stop; see `VoxelMap.cast_rays`."""
     directions = _vectors(directions, "directions")
@@ -117,7 +117,7 @@ def cast_rays(
     return hits
 
 
-def check_boxes(asked: Asked, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
+def check_boxes(asked: QueryTarget, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
     """Return the worst state in boxes; see `VoxelMap.check_boxes`."""
     low, high = _vectors(low, "low"), _vectors(high, "high")
     _check_number("low", low, "high", high, one_for_all=False)
@@ -128,7 +128,7 @@ def check_boxes(asked: Asked, low: ArrayLike, high: ArrayLike) -> NDArray[np.uin
     return _states_of(levels)
 
 
-def check_capsules(asked: Asked, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
+def check_capsules(asked: QueryTarget, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
     """Return the worst state that capsules touch; see `VoxelMap.check_capsules`."""
     start, end = _within_limits(asked, _vectors(start, "start"), "start"), _vectors(end, "end")
     end = _within_limits(asked, end, "end")
@@ -140,7 +140,7 @@ def check_capsules(asked: Asked, start: ArrayLike, end: ArrayLike, radius: Array
     return _states_of(levels)
 
 
-def nearest(asked: Asked, points: ArrayLike, max_distance: float, obstacles: Iterable[State]) -> NearestCells:
+def nearest(asked: QueryTarget, points: ArrayLike, max_distance: float, obstacles: Iterable[State]) -> NearestCells:
     """Return what is nearest to points; see `VoxelMap.nearest_obstacle`."""
     points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), state_bits(obstacles, "obstacles")
     n = len(points)
@@ -162,7 +162,7 @@ def state_bits(states: Iterable[State], name: str) -> NDArray[np.uint8]:
     return np.bitwise_or.reduce(_each(wanted)).reshape(1)
 
 
-def _read(asked: Asked) -> tuple[StoredCells, Thresholds]:
+def _read(asked: QueryTarget) -> tuple[StoredCells, Thresholds]:
     return asked.cells, asked.rules.thresholds
 
 
@@ -223,7 +223,7 @@ def distance_of(metres: float) -> float:
     return float(lengths[0])
 
 
-def _within_limits(asked: Asked, numbers: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+def _within_limits(asked: QueryTarget, numbers: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     """Return metres (N, 3) or (N,) as they are."""
     limit = INDEX_LIMIT * np.array(asked.sides)
     if not (np.abs(numbers) < (limit if numbers.ndim > 1 else min(limit))).all():

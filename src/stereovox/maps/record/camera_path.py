@@ -24,7 +24,7 @@ POSE = 12
 """Numbers of a pose."""
 
 
-class Seen(NamedTuple):
+class StampedPose(NamedTuple):
     """Pose of a sensor at a time: the 12 numbers of the upper three rows of T_world_sensor, row by row."""
 
     stamp_ns: int
@@ -40,14 +40,14 @@ class CameraPath:
     """
 
     spacing: float = SPACING_M
-    stops: dict[str, list[Seen]] = field(default_factory=dict)
+    stops: dict[str, list[StampedPose]] = field(default_factory=dict)
 
-    def walk(self, sensor: str, seen: Seen) -> None:
+    def walk(self, sensor: str, seen: StampedPose) -> None:
         """Add a pose if it is far enough from the last one of its sensor."""
         stops = self.stops.setdefault(sensor, [])
         if stops and not self._is_far(stops[-1], seen):
             return
-        stops.append(Seen(seen.stamp_ns, tuple(array("f", seen.pose))))
+        stops.append(StampedPose(seen.stamp_ns, tuple(array("f", seen.pose))))
         while sum(map(len, self.stops.values())) > MAX_STOPS:
             self.spacing *= 2
             self.stops = {name: self._thinned(kept) for name, kept in self.stops.items()}
@@ -95,11 +95,11 @@ class CameraPath:
             raise ValueError(f"camera_path: more than {MAX_STOPS} poses")
         return cls(spacing, stops)
 
-    def _is_far(self, before: Seen, now: Seen) -> bool:
+    def _is_far(self, before: StampedPose, now: StampedPose) -> bool:
         metres, radians = apart(before.pose, now.pose)
         return metres >= self.spacing or radians >= 2 * self.spacing
 
-    def _thinned(self, stops: list[Seen]) -> list[Seen]:
+    def _thinned(self, stops: list[StampedPose]) -> list[StampedPose]:
         kept = stops[:1]
         for seen in stops[1:]:
             if self._is_far(kept[-1], seen):
@@ -121,9 +121,9 @@ def _unpacked(text: Any, dtype: str) -> NDArray[Any]:
     return np.frombuffer(base64.b64decode(text, validate=True), dtype)
 
 
-def _stops_from(saved: Any) -> list[Seen]:
+def _stops_from(saved: Any) -> list[StampedPose]:
     stamps, numbers = _unpacked(saved["stamps_ns"], "<i8"), _unpacked(saved["poses"], "<f4")
     if len(numbers) != POSE * len(stamps) or not (np.abs(numbers) <= FARTHEST).all():  # False for NaN
         raise ValueError("camera_path: poses that cannot be")
     poses = map(tuple, numbers.reshape(-1, POSE).tolist())
-    return [Seen(stamp_ns, pose) for stamp_ns, pose in zip(stamps.tolist(), poses, strict=True)]
+    return [StampedPose(stamp_ns, pose) for stamp_ns, pose in zip(stamps.tolist(), poses, strict=True)]

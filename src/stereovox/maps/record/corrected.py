@@ -8,11 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from stereovox.geometry.se3 import Transform, inverse
-from stereovox.maps.record.camera_path import CameraPath, Seen
+from stereovox.maps.record.camera_path import CameraPath, StampedPose
 from stereovox.maps.record.history import History
 
 
-def correct_history(history: History, before: Sequence[tuple[str, Seen]], after: Sequence[tuple[str, Seen]]) -> None:
+def correct_history(
+    history: History, before: Sequence[tuple[str, StampedPose]], after: Sequence[tuple[str, StampedPose]]
+) -> None:
     """Give a history the corrected poses, so that the next frames are compared with these.
 
     What a sensor's frames waited for, or were in doubt of, was the map of before: it begins anew. So do the lines of
@@ -29,12 +31,12 @@ def correct_history(history: History, before: Sequence[tuple[str, Seen]], after:
             _correct_sensor(history, sensor, old, new)
 
 
-def matrix_of(seen: Seen) -> Transform:
+def matrix_of(seen: StampedPose) -> Transform:
     """Return T_world_sensor (4, 4)."""
     return np.array([*seen.pose, 0, 0, 0, 1], float).reshape(4, 4)
 
 
-def _correct_sensor(history: History, sensor: str, old: Seen, new: Seen) -> None:
+def _correct_sensor(history: History, sensor: str, old: StampedPose, new: StampedPose) -> None:
     """Move what is remembered of a sensor as its last frame was moved."""
     T_new_old = matrix_of(new) @ inverse(matrix_of(old))
     history.waiting.pop(sensor, None)
@@ -47,4 +49,4 @@ def _correct_sensor(history: History, sensor: str, old: Seen, new: Seen) -> None
 
 
 def _moved(pose: tuple[float, ...], T_new_old: Transform) -> tuple[float, ...]:
-    return tuple((T_new_old @ matrix_of(Seen(0, pose))).ravel().tolist()[:12])
+    return tuple((T_new_old @ matrix_of(StampedPose(0, pose))).ravel().tolist()[:12])

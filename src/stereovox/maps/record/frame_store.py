@@ -24,7 +24,7 @@ from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import count_in, json_value, read_bounded
 from stereovox.frame import MAX_POINTS
-from stereovox.maps.record.camera_path import FARTHEST, Seen
+from stereovox.maps.record.camera_path import FARTHEST, StampedPose
 from stereovox.maps.record.health import FULL
 from stereovox.maps.record.kept_frames import DTYPES, InFile, KeptFrame, KeptFrames, Packed, PackedCloud, digest_of
 
@@ -205,7 +205,7 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera | Lidar], pack: Path
         saved["quality"], (abs(turn), abs(shift)), float(saved["depth_scale"]),
         inf if saved["farthest"] is None else float(saved["farthest"]),
         _packed_from(saved, content, camera),
-        Seen(int(stamp_ns), tuple(_numbers(pose))), blocks,
+        StampedPose(int(stamp_ns), tuple(_numbers(pose))), blocks,
     )  # fmt: skip
 
 

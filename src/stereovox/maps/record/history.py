@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.errors import one_line, shortened
 from stereovox.maps.record.camera_path import FARTHEST, CameraPath
-from stereovox.maps.record.camera_path import Seen as Seen
+from stereovox.maps.record.camera_path import StampedPose as StampedPose
 from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.loop_lines import LoopLines
 
@@ -37,11 +37,11 @@ class Streak(NamedTuple):
 
     why: str
     since_ns: int
-    last: Seen
+    last: StampedPose
 
 
-class Look(NamedTuple):
-    """The last image of a sensor: its checksum and the pose it was first seen at, as in `Seen`."""
+class ImageFingerprint(NamedTuple):
+    """The last image of a sensor: its checksum and the pose it was first seen at, as in `StampedPose`."""
 
     digest: int
     pose: tuple[float, ...]
@@ -59,7 +59,7 @@ class RunningMean(NamedTuple):
         return RunningMean(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
 
 
-class Doubt(NamedTuple):
+class DisagreementSpell(NamedTuple):
     """Frames of one sensor that disagree with the map: stamps of the first and the last, and how many follow the first.
 
     fits: how many of them would agree from another pose. verdict: CHANGED or MOVED; "" while it is open. looks: how
@@ -74,7 +74,7 @@ class Doubt(NamedTuple):
     looks: int = 0
     glance: Glance | None = None
 
-    def going_on(self, stamp_ns: int) -> Doubt:
+    def going_on(self, stamp_ns: int) -> DisagreementSpell:
         """Return the doubt after one more frame."""
         return self._replace(last_ns=stamp_ns, frames=self.frames + 1)
 
@@ -114,7 +114,7 @@ class History:
         frames: Number of frames in the map.
         refused: Number of refused frames, by reason.
         settled: How often frames were accepted again after a jump, a reset or a disagreement, by its reason.
-        ways: Number of frames by quality level (`full`, `near`, `coarse`).
+        quality: Number of frames by quality level (`full`, `near`, `coarse`).
         recording: Name of the recording, if known.
         last_frame: Name and stamp of the frame offered last.
         trusted: Last trusted frame of each sensor.
@@ -132,15 +132,15 @@ class History:
     frames: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     settled: Counter[str] = field(default_factory=Counter)
-    ways: Counter[str] = field(default_factory=Counter)
+    quality: Counter[str] = field(default_factory=Counter)
     recording: str = ""
     last_frame: tuple[str, int] | None = None
-    trusted: dict[str, Seen] = field(default_factory=dict)
+    trusted: dict[str, StampedPose] = field(default_factory=dict)
     waiting: dict[str, Streak] = field(default_factory=dict)
     path: CameraPath = field(default_factory=CameraPath)
-    looks: dict[str, Look] = field(default_factory=dict)
+    looks: dict[str, ImageFingerprint] = field(default_factory=dict)
     usual: dict[str, RunningMean] = field(default_factory=dict)
-    doubts: dict[str, Doubt] = field(default_factory=dict)
+    doubts: dict[str, DisagreementSpell] = field(default_factory=dict)
     imported: Imported | None = None
     loops: LoopLines | None = None
     recordings: int = 1
@@ -180,7 +180,7 @@ class History:
             "history": {
                 "refused": dict(self.refused),
                 "settled": dict(self.settled),
-                "ways": dict(self.ways),
+                "quality": dict(self.quality),
                 "trusted": {name: _seen_to(seen) for name, seen in self.trusted.items()},
                 "waiting": {
                     name: {"why": streak.why, "since_ns": streak.since_ns, **_seen_to(streak.last)}
@@ -211,8 +211,8 @@ class History:
             recordings=_whole(saved["recordings"], "recordings", 1),
         )
         entries = saved["history"]
-        history.refused, history.settled, history.ways = (
-            _counts(entries[name], name) for name in ("refused", "settled", "ways")
+        history.refused, history.settled, history.quality = (
+            _counts(entries[name], name) for name in ("refused", "settled", "quality")
         )
         history.trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
         history.waiting = {name: _streak_from(streak) for name, streak in _sensors(entries["waiting"]).items()}
@@ -269,31 +269,31 @@ class WithHistory:
         self.history.recording = name
 
 
-def _seen_to(seen: Seen) -> dict[str, Any]:
+def _seen_to(seen: StampedPose) -> dict[str, Any]:
     return {"stamp_ns": seen.stamp_ns, "pose": list(seen.pose)}
 
 
-def _seen_from(saved: Any) -> Seen:
-    return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), _pose_from(saved["pose"]))
+def _seen_from(saved: Any) -> StampedPose:
+    return StampedPose(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), _pose_from(saved["pose"]))
 
 
-def _look_from(saved: Any) -> Look:
-    return Look(_whole(saved["digest"], "history: digest"), _pose_from(saved["pose"]))
+def _look_from(saved: Any) -> ImageFingerprint:
+    return ImageFingerprint(_whole(saved["digest"], "history: digest"), _pose_from(saved["pose"]))
 
 
-def _doubt_to(doubt: Doubt) -> dict[str, Any]:
+def _doubt_to(doubt: DisagreementSpell) -> dict[str, Any]:
     glance = None if doubt.glance is None else {"pose": list(doubt.glance.pose), "ranges": doubt.glance.packed()}
     return {**doubt._asdict(), "glance": glance}
 
 
-def _doubt_from(saved: Any) -> Doubt:
+def _doubt_from(saved: Any) -> DisagreementSpell:
     since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
     frames, fits, looks = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits", "looks"))
     if saved["verdict"] not in ("", CHANGED, MOVED):
         raise ValueError("history: a doubt has no such verdict")
     glance = saved["glance"]
     seen = None if glance is None else Glance.unpacked(_pose_from(glance["pose"]), glance["ranges"])
-    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"], looks, seen)
+    return DisagreementSpell(since_ns, last_ns, frames, fits, saved["verdict"], looks, seen)
 
 
 def _usual_from(saved: Any) -> RunningMean:

@@ -22,7 +22,7 @@ from stereovox.frame import Cloud, Frame
 from stereovox.geometry.se3 import Transform, apart
 from stereovox.maps.cells import _packing
 from stereovox.maps.cells.evidence import Evidence
-from stereovox.maps.record.camera_path import Seen
+from stereovox.maps.record.camera_path import StampedPose
 
 LEVEL = 1
 """Of zstd: higher ones take twice as long for less than a twentieth of the bytes."""
@@ -193,7 +193,7 @@ class KeptFrame:
     depth_scale: float
     farthest: float
     packed: Packed | PackedCloud
-    seen: Seen
+    seen: StampedPose
     blocks: NDArray[np.int32]
 
     def frame(self) -> Frame | Cloud:
@@ -254,7 +254,7 @@ class KeptFrames:
         """Return whether these are all of so many frames."""
         return len(self._frames) == frames
 
-    def wants(self, sensor: str, seen: Seen) -> bool:
+    def wants(self, sensor: str, seen: StampedPose) -> bool:
         """Return whether a frame of this sensor from this pose is to be kept."""
         before = self._last.get(sensor)
         return before is None or self._is_far(before, seen)
@@ -276,12 +276,12 @@ class KeptFrames:
         self._frames, self._bytes = frames, sum(frame.packed.content.size for frame in frames)
         self._last = {frame.sensor: frame.seen for frame in frames}
 
-    def _is_far(self, before: Seen, now: Seen) -> bool:
+    def _is_far(self, before: StampedPose, now: StampedPose) -> bool:
         metres, angle = apart(before.pose, now.pose)
         return metres >= self.spacing or angle >= 2 * self.spacing
 
     def _thinned(self) -> list[KeptFrame]:
-        last: dict[str, Seen] = {}
+        last: dict[str, StampedPose] = {}
         kept: list[KeptFrame] = []
         for frame in self._frames:
             if frame.sensor not in last or self._is_far(last[frame.sensor], frame.seen):
@@ -300,7 +300,7 @@ def kept_frame(
     packed: Packed | PackedCloud,
     number: int,
     sensor: str,
-    seen: Seen,
+    seen: StampedPose,
     quality: str,
     evidence: Evidence,
 ) -> KeptFrame:

@@ -181,7 +181,7 @@ class BoxedStorage(Storage):
         """Raise StereovoxError: a map in boxes is only read."""
         self._refuse()
 
-    def look_from(self, viewpoint: Viewpoint) -> None:
+    def set_viewpoint(self, viewpoint: Viewpoint) -> None:
         """Raise StereovoxError: a map in boxes is only read."""
         self._refuse()
 

@@ -93,15 +93,15 @@ class RollingStorage(Storage):
             self._take_over()
             self._rehearse()
 
-    def become(self, other: Storage) -> None:
+    def replace_contents(self, other: Storage) -> None:
         """Take over all cells, the window and the tiles of a map of the same settings, not to be used any more."""
         assert isinstance(other, RollingStorage)
         self.close()
-        super().become(other)
+        super().replace_contents(other)
         self._window, self._earlier, self._turned, self._since = other._window, None, other._turned, other._since
         self._store, self._times_store = other._store, other._times_store
 
-    def look_from(self, viewpoint: Viewpoint) -> None:
+    def set_viewpoint(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands and move the window after it.
 
         Raises MapFileError, and changes nothing, where an earlier tile could not be written.
@@ -111,7 +111,7 @@ class RollingStorage(Storage):
                 store.check()
         if self._times_store is not None and self.viewpoint is not None:
             self._note_time(self.viewpoint.stamp_ns, viewpoint.stamp_ns)
-        super().look_from(viewpoint)
+        super().set_viewpoint(viewpoint)
         before = self._window.box
         position = viewpoint.T_world_camera[:3, 3].tolist()
         now = self._window.follow(position, viewpoint.stamp_ns)

@@ -151,7 +151,7 @@ class Storage(Guarded):
         """Coordinates (n, 3) of the blocks that are in memory, in no order."""
         return self._pool.block_coords
 
-    def make_anew(self, coords: NDArray[np.int32], other: Storage) -> None:
+    def replace_blocks(self, coords: NDArray[np.int32], other: Storage) -> None:
         """Take over blocks (n, 3) from a map of the same settings, with their times; unknown where it has none."""
         coords = np.ascontiguousarray(coords, np.int32)
         self._pool.remove(coords)
@@ -162,7 +162,7 @@ class Storage(Guarded):
         if self._times is not None:
             self._times.put(found, other.times_of(found))
 
-    def become(self, other: Storage) -> None:
+    def replace_contents(self, other: Storage) -> None:
         """Take over all cells of a map of the same settings, which must not be used any more."""
         self._pool, self._times = other._pool, other._times
         self.viewpoint, self.window_state = other.viewpoint, other.window_state
@@ -179,7 +179,7 @@ class Storage(Guarded):
         if self._times is not None:
             self._times.remove(coords)
 
-    def look_from(self, viewpoint: Viewpoint) -> None:
+    def set_viewpoint(self, viewpoint: Viewpoint) -> None:
         """Set where the camera stands; a bounded map moves with it, cells without evidence for long are forgotten."""
         before, self.viewpoint = self.viewpoint, viewpoint
         if self._times is not None:

@@ -18,7 +18,7 @@ SIDES = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Steps to neighbours; each leads both ways."""
 
 
-class LevelWays:
+class LevelPlanner:
     """Shortest ways of a ball at one height through columns of cells that are known to be free.
 
     A column is free where all its cells in a band about the height are. Of a map whose `up` is z.
@@ -61,7 +61,7 @@ class LevelWays:
         best = np.unravel_index(np.argmax(room), room.shape)
         return (self._place(np.array(best)), float(room[best])) if room[best] > 0 else None
 
-    def way_to(self, goal: ArrayLike, near: float = 0.3) -> NDArray[np.float64] | None:
+    def path_to(self, goal: ArrayLike, near: float = 0.3) -> NDArray[np.float64] | None:
         """Return the way (N, 3) in metres from the start to the place nearest to a goal.
 
         Args:

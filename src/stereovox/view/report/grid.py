@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.evaluate.grids.grid_lattice import Laid
+from stereovox.evaluate.grids.grid_lattice import AlignedGrids
 from stereovox.evaluate.grids.grid_scores import GridScores
 from stereovox.view.grid_difference import binary_png, difference_png, side_by_side_png
 from stereovox.view.report import page
@@ -35,7 +35,7 @@ DIFFERENCE = (
 
 
 def write_grid_report(
-    folder: str | Path, scores: GridScores, laid: Laid, name: str = "The map", reference: str = "the reference"
+    folder: str | Path, scores: GridScores, laid: AlignedGrids, name: str = "The map", reference: str = "the reference"
 ) -> Path:
     """Write `evaluation.html` and `difference.png`, one pixel per cell, into `folder`; return the page's path.
 
@@ -45,7 +45,7 @@ def write_grid_report(
     return page.write_files(folder, {"evaluation.html": text.encode(), "difference.png": binary_png(laid)})
 
 
-def grid_page(scores: GridScores, laid: Laid, name: str, reference: str) -> str:
+def grid_page(scores: GridScores, laid: AlignedGrids, name: str, reference: str) -> str:
     """Return the page as text; see `write_grid_report`."""
     return page.page(
         "How good is the floor's map?",

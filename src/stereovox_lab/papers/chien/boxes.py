@@ -151,7 +151,7 @@ def map_together(configs: Sequence[Config], simulation: Simulation) -> list[Voxe
     for i in range(len(simulation)):
         image = prepare(simulation.frame(i), configs[0])
         for voxel_map, integrator in zip(maps, integrators, strict=True):
-            voxel_map.storage.look_from(image.viewpoint)
+            voxel_map.storage.set_viewpoint(image.viewpoint)
             voxel_map.add(integrator.evidence(image))
             voxel_map.frames += 1
     return maps

@@ -116,7 +116,7 @@ class _Run:
         T = image.T_world_sensor.copy()
         T[:3, 3] += self._shift
         moved = replace(image, T_world_sensor=T)
-        self._map.storage.look_from(moved.viewpoint)
+        self._map.storage.set_viewpoint(moved.viewpoint)
         self._map.add(self._integrator.evidence(moved))
         self._map.frames += 1
 

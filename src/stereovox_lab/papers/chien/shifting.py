@@ -91,7 +91,7 @@ def fly(outside: str, *, length_m: float = 80.0, step: Callable[[], None] = lamb
     for frame in simulation:
         image = prepare(frame, config)
         start = perf_counter()
-        voxel_map.storage.look_from(image.viewpoint)
+        voxel_map.storage.set_viewpoint(image.viewpoint)
         ms = 1e3 * (perf_counter() - start)
         voxel_map.add(integrator.evidence(image))
         voxel_map.frames += 1

@@ -201,7 +201,7 @@ class _Condition:
 
 
 def _update(integrator: Any, voxel_map: Any, image: DepthImage) -> None:
-    voxel_map.storage.look_from(image.viewpoint)
+    voxel_map.storage.set_viewpoint(image.viewpoint)
     voxel_map.add(integrator.evidence(image))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import Laid, Rectangle
+from stereovox.evaluate.grids.grid_lattice import AlignedGrids, Rectangle
 from stereovox.evaluate.grids.grid_scores import GridScores, laid_on, score_laid
 from stereovox.evaluate.trajectory.trajectory import TrajectoryError, trajectory_error
 from stereovox.formats.map_server import read_map_server, write_map_server
@@ -58,7 +58,7 @@ class Judged:
     """
 
     made: Made
-    laid: Laid
+    laid: AlignedGrids
     scores: GridScores
     with_door: GridScores
     of_building: dict[str, GridScores]

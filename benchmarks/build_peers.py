@@ -5,7 +5,7 @@
     STEREOVOX_PEERS=BUILT stereovox bench RECORDING --peers octomap-cpp,bonxai,ufomap,wavemap-cpp
 
 FOLDER holds checkouts of any of OctoMap/octomap, facontidavide/Bonxai, UnknownFreeOccupied/ufomap and ethz-asl/wavemap,
-in folders of these names. What they need beside a compiler, on Debian: libeigen3-dev (Bonxai, wavemap),
+in folders of these names. What they need next to a compiler, on Debian: libeigen3-dev (Bonxai, wavemap),
 libgoogle-glog-dev and libboost-dev (wavemap), liblz4-dev and libtbb-dev (UFOMap). Nothing of theirs becomes part of
 stereovox.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near `stereovox calibrate stereo` comes to the truth beside OpenCV's stereoCalibrate, on simulated chessboards.
+"""How near `stereovox calibrate stereo` comes to the truth next to OpenCV's stereoCalibrate, on simulated chessboards.
 
 Both are given the same corners and drop pairs that do not fit by the same rule. Cameras, boards and noise differ with
 each seed. OpenCV has a fisheye tried at each focal length that `fit_stereo` tries, and keeps the best.
@@ -186,7 +186,7 @@ def errors(found: Eyes, true: Eyes, rng: np.random.Generator) -> list[float]:
 
 
 def tried(fit: Callable[..., Fit], model: str, case: dict[str, float], seed: int) -> tuple[list[float] | None, float]:
-    """Return the errors, None where it failed, and the seconds taken."""
+    """Return the errors, None if it failed, and the seconds taken."""
     rng = np.random.default_rng(seed)
     true = eyes_of(model, rng)
     pairs = pairs_of(true, rng, **case)

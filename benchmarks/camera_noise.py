@@ -33,7 +33,7 @@ SIDE = 24
 """Pixels across a square."""
 LAGS = 12
 BLOCK = 8
-"""Pixels across the blocks whose mean tells how many independent looks they hold."""
+"""Pixels across the blocks whose mean reports how many independent looks they hold."""
 MIN_KNOWN, MIN_FLAT, MAX_SIGMA, CURVED = 0.3, 0.9, 1.0, 0.85
 """A square counts with this share of values, that share of them on a plane, less noise than this in pixels, and a
 quadratic surface that leaves at least this share of the plane's residual: else it is curved."""
@@ -58,7 +58,7 @@ class Square:
 
     row, column: its first pixel. z: depth of its middle in metres; angle_deg: between its normal and the ray there.
     sigma_px: noise of its disparity. residual (SIDE, SIDE) in pixels, NaN: no value or a gross error. known, gross:
-    shares of pixels with a value, and of these of gross errors. grey: mean brightness, NaN where it is not known.
+    shares of pixels with a value, and of these of gross errors. grey: mean brightness, NaN if it is not known.
     """
 
     row: int
@@ -146,13 +146,13 @@ def flat_squares(disparity: NDArray, camera: Any, px_m: float, grey: NDArray | N
 
 
 def mean_of(values: NDArray) -> float:
-    """Return the mean of those that are known, NaN where none is."""
+    """Return the mean of those that are known, NaN if none is."""
     known = np.isfinite(values)
     return float(values[known].mean()) if known.any() else np.nan
 
 
 def on_plane(values: NDArray) -> tuple[NDArray, NDArray[np.bool_]] | None:
-    """Return the plane (3,) of a square's disparities and which lie on it; None where they are on none."""
+    """Return the plane (3,) of a square's disparities and which lie on it; None if they are on none."""
     known = np.isfinite(values)
     if known.mean() < MIN_KNOWN:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of a lidar: time a cloud and how well a held-out one is foretold, beside other libraries on the same points.
+"""Clouds of a lidar: time a cloud and how well a held-out one is foretold, next to other libraries on the same points.
 
     python benchmarks/clouds.py 'DRIVE?sensor=velodyne' [--voxel-size 0.2] [--max-range 60] [--every 5] [--frames A:B:S]
         [--peers octomap octomap-cpp wavemap-cpp] [--rounds 3] [setting=value ...]

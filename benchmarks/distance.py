@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long the distance field of a window takes: made anew, and brought up to date after each frame; beside SciPy.
+"""How long the distance field of a window takes: made anew, and brought up to date after each frame; next to SciPy.
 
     python benchmarks/distance.py RECORDING [FRAMES] [--voxel-size 0.05] [--size 10,3,10] [--json]
 
@@ -111,7 +111,7 @@ def scipys(field: DistanceField, voxel_size: float) -> np.ndarray:
 
 
 def edts(field: DistanceField, voxel_size: float) -> float | None:
-    """Return the CPU of edt in milliseconds; None where it is not installed."""
+    """Return the CPU of edt in milliseconds; None if it is not installed."""
     try:
         import edt
     except ImportError:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long do ghosts stay, and does a thin pole stay that is often missed? Four models beside each other.
+"""How long do ghosts stay, and does a thin pole stay that is often missed? Four models next to each other.
 
     python benchmarks/dynamic.py [--voxel-size 0.1] [--width 424] [--pole 0.03] [--missed background|unmatched] [--json]
                                  [--picture dynamic.png]
 
 A person walks across the view of a simulated D435 that stands, 30 frames a second, and is gone. Behind: a wall within
-range; nothing, and the camera says so; nothing, and the camera does not say why it has no value. A pole beside the way
+range; nothing, and the camera says so; nothing, and the camera does not say why it has no value. A pole next to the way
 is measured in one frame of three; in the others it has no value, or what is behind it shows.
 """
 

@@ -127,7 +127,7 @@ def speed(folder: Path, recordings: Sequence[str], given: argparse.Namespace, se
 
 
 def predicted(place: Place, made: sv.FleetMap) -> float:
-    """Return the overlap by how large what frames see is beside a box."""
+    """Return the overlap by how large what frames see is next to a box."""
     keys, extents = {name.split("/")[1] for name in place.names("recordings/")}, []
     for key in keys:
         with frames_of(place, key, range(next(one.frames for one in made.recordings))) as frames:

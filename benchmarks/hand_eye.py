@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near `hand_eye` comes to the truth beside OpenCV's calibrateHandEye, on simulated motions.
+"""How near `hand_eye` comes to the truth next to OpenCV's calibrateHandEye, on simulated motions.
 
 OpenCV 5 has no calibrateHandEye: this needs `opencv-python-headless<5`. It wants poses where registration gives motions
 between images, so it is given the motions one behind the other, with the drift that this adds up.

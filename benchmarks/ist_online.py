@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chain of IST 2019 online: a bag of sim:floor is played to the node in real time, beside the same bag offline.
+"""The chain of IST 2019 online: a bag of sim:floor is played to the node in real time, next to the same bag offline.
 
 Makes the reference map by SLAM of a first drive, writes the second drive as a bag, maps it offline (`stereovox grid`)
 and by the node (`stereovox ros2`), and compares Eq 7. With --slam the lidar's first drive is played as well, and the

@@ -107,7 +107,7 @@ def contents(out: Path) -> dict[str, Any]:
 
 
 def left_over(out: Path) -> list[str]:
-    """Return what lies in and beside a map and belongs to no whole one."""
+    """Return what lies in and next to a map and belongs to no whole one."""
     data = json.loads((out / "manifest.json").read_text())["data"]
     inside = [entry.name for entry in out.iterdir() if entry.name not in (data, "manifest.json")]
     return inside + [entry.name for entry in out.parent.iterdir() if entry != out]

@@ -73,7 +73,7 @@ class Way:
 class Film:
     """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one way through the loop.
 
-    With a contrast above 0, pictures of the colour camera beside the first one in another, (images, 480, 640) uint8.
+    With a contrast above 0, pictures of the colour camera next to the first one in another, (images, 480, 640) uint8.
     """
 
     T_depth_eye = np.eye(4)

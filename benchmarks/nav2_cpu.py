@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node costs beside Nav2: its share of a core at 160x120 and 640x480, 15 and 30 Hz, with all that Nav2 takes.
+"""What the node costs next to Nav2: its share of a core at 160x120 and 640x480, 15 and 30 Hz, with all that Nav2 takes.
 
     python benchmarks/nav2_cpu.py [--seconds 20] [--json]
 
@@ -7,7 +7,7 @@ Images of a simulated Kinect, cells of 0.05 m to 5 m, a 2-D map twice a second, 
 second: the parameters of `stereovox ros2 --write-nav2`. As benchmarks/ros2.py measures it: CPU time of the node's
 process, receiving, mapping and publishing included, over the time on the wall.
 
-Beside it: users of spatio_temporal_voxel_layer report "more than 100%" at 160x120 and 30 Hz with cells of 0.2 m (issue
+Next to it: users of spatio_temporal_voxel_layer report "more than 100%" at 160x120 and 30 Hz with cells of 0.2 m (issue
 182), and "more than 160%" with a D435i and cells of 0.05 m in ROS 2 (issue 188): on their machines, not on this one.
 
 Target: less than half a core at 160x120 and 30 Hz.

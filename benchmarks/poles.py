@@ -27,7 +27,7 @@ from stereovox.frame import Reason, StereoFrame
 
 HEIGHT, WIDTH, FINE = 200, 480, 8
 MARGIN = 32
-"""Columns of wall beside the image, for the other eye."""
+"""Columns of wall next to the image, for the other eye."""
 WIDTHS = 1.0, 2.0, 4.0
 NOISE = 2.0
 GRAIN = (32, 1.0), (16, 1.0), (8, 1.0), (4, 1.0), (2, 1.0), (1, 0.5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries a second, one thread, beside octomap-python on the same cells where it is installed.
+"""Queries a second, one thread, next to octomap-python on the same cells where it is installed.
 
     python benchmarks/queries.py RECORDING [FRAMES] [--voxel-size 0.05] [--json]     for example recordings/kitchen ::4
 

@@ -3,7 +3,7 @@
 
 python benchmarks/slam_drives.py 0:50 [--verbose] [setting=value ...]
 
-A map is wrong where a pose of its track, after the best rigid fit to the true one, is off by more than 0.5 m.
+A map is wrong if a pose of its track, after the best rigid fit to the true one, is off by more than 0.5 m.
 """
 
 import argparse
@@ -152,7 +152,7 @@ def panes(walls: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, n
 
 
 def walker(stops: list, count: int, random: np.random.Generator) -> se2.Pose:
-    """Return where a person is at each step (count, 2): to and fro along the stops, beside the robot's line."""
+    """Return where a person is at each step (count, 2): to and fro along the stops, next to the robot's line."""
     path = drive([Stop(*stop) for stop in stops], random.uniform(0.6, 1.3))[:, :2]
     path = np.vstack([path, path[::-1]]) + random.uniform(-0.5, 0.5, 2)
     return path[(int(random.integers(len(path))) + np.arange(count)) % len(path)]

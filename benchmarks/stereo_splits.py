@@ -6,7 +6,8 @@
 
 FOLDER: scenes of KITTI stereo 2015, as for stereo2015.py. Of every way to take half of them (or those of `--choose`, by
 place), the settings of the grid with the fewest errors over 3 px on that half are chosen, each with the confidence that
-leaves `--density` per cent of the truth's pixels there; what they do on the other half is reported, beside the defaults
+leaves `--density` per cent of the truth's pixels there; what they do on the other half is reported, next to the
+defaults
 and what was best there in hindsight. `--pairs`: scenes of Middlebury, never chosen on: folders with im2, im6 and disp2
 (2001, 2003) or view1, view5 and disp1 (2005, 2006), disparity = value / SCALE, searched up to 80.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking on recordings that bring poses: error, share of frames that are lost, processor time; beside peers.
+"""Tracking on recordings that bring poses: error, share of frames that are lost, processor time; next to peers.
 
     python benchmarks/track.py RECORDING [RECORDING ...] [--frames A:B:S] [--peers] [--json] [setting=value ...]
 
@@ -31,7 +31,7 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracker
 
 Track = Callable[[AnyFrame], NDArray[np.float64] | None]
-"""Takes a frame; returns its pose (4, 4) in a world of its own, None where it is lost."""
+"""Takes a frame; returns its pose (4, 4) in a world of its own, None if it is lost."""
 
 
 def stereovox(settings: dict[str, Any]) -> Track:

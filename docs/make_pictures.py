@@ -86,14 +86,14 @@ def run(*words: str) -> None:
 
 
 def shrink(file: Path, name: str) -> None:
-    """Save a smaller picture beside this file; a palette fitted to it keeps the gradients in a small file."""
+    """Save a smaller picture next to this file; a palette fitted to it keeps the gradients in a small file."""
     picture = Image.open(file).convert("RGB")
     small = picture.resize((1280, round(1280 * picture.height / picture.width)), Image.Resampling.LANCZOS)
     small.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2).save(HERE / name, optimize=True)
 
 
 def save(figure: plt.Figure, name: str) -> None:
-    """Write one picture beside this file."""
+    """Write one picture next to this file."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.set(w_pad=0.2, h_pad=0.2)  # pyright: ignore[reportCallIssue] - inches of free paper about it
@@ -114,7 +114,7 @@ def flat(point: object) -> np.ndarray:
 
 
 def arrow(axes: plt.Axes, start: np.ndarray, end: np.ndarray, colour: str, word: str, off: tuple[float, float]) -> None:
-    """Draw an arrow and its word beside the tip."""
+    """Draw an arrow and its word next to the tip."""
     axes.annotate(
         "", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.2, "shrinkA": 0, "shrinkB": 0}
     )

@@ -257,7 +257,7 @@ def _value(value: Any) -> str:
 
 
 def _sensors() -> str:
-    lines = ["The parameters of a model stand beside its name, for example `sensor.p_free`:", ""]
+    lines = ["The parameters of a model stand next to its name, for example `sensor.p_free`:", ""]
     lines += ["| `sensor.model` | parameters and defaults | |", "|---|---|---|"]
     for name in SENSORS:
         model = registry.find("sensors", SENSORS, name)

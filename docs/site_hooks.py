@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
-"""Files beside docs/ that become pages."""
+"""Files next to docs/ that become pages."""
 INTO_DOCS = re.compile(r"\]\(docs/")
 
 

@@ -10,7 +10,7 @@ for frame in sv.open_source("sim:room", frames=":10"):  # or a folder
 m = mapper.map
 points = [[4.0, -2.0, 1.0], [2.15, -2.35, 0.45], [3.0, 0.0, 1.0]]  # metres, world frame
 print(m.state(points))  # 0 unknown, 1 free, 2 tentative, 3 occupied: sv.State
-print(m.probability(points))  # 0.5 where nothing is known
+print(m.probability(points))  # 0.5 if nothing is known
 m.occupied()  # (N, 3) centres of all occupied cells
 
 m.save("room.svox")

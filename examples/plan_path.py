@@ -20,7 +20,7 @@ STEPS = [np.array(step) for step in product((-1, 0, 1), repeat=3) if any(step)]
 
 
 def plan(m, start, goal, radius, through_unknown=False):
-    """Return the way (N, 3) in metres from `start` to `goal` for a ball of `radius` metres; None if there is none."""
+    """Return the way (N, 3) in metres from `start` to `goal` for a ball of `radius` metres; None if missing."""
     obstacles = [sv.State.OCCUPIED, sv.State.TENTATIVE] + ([] if through_unknown else [sv.State.UNKNOWN])
     corners = np.array([*m.bounds(), start, goal])
     box = corners.min(axis=0) - 2 * radius, corners.max(axis=0) + 2 * radius

@@ -21,7 +21,7 @@ class Unbounded(AssertionError):  # noqa: N818 - reads as what happened
 
 
 def check(target: Target, data: bytes, folder: Path, most_seconds: float = MAX_SECONDS) -> str:
-    """Return `read` or `refused`; raises what the target raised, and Unbounded, where that is not allowed."""
+    """Return `read` or `refused`; raises what the target raised, and Unbounded, if that is not allowed."""
     memory, start = peak_bytes(), time.process_time()
     try:
         target.read(data, folder)

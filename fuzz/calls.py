@@ -32,7 +32,7 @@ RENEWED = 150
 
 
 class Outcome(NamedTuple):
-    """What a call did. status: None where it raised. printed: all that came out on stderr."""
+    """What a call did. status: None if it raised. printed: all that came out on stderr."""
 
     words: list[str]
     status: int | None
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     seconds: float
 
     def problem(self) -> str:
-        """Return what must not happen, empty where nothing did."""
+        """Return what must not happen, empty if nothing did."""
         errors = [line for line in self.printed.splitlines() if line.startswith("stereovox: ")]
         if self.status is None or "Traceback" in self.printed:
             return "raised"

@@ -175,7 +175,7 @@ class Tried:
 
 
 def check(holds: bool, otherwise: str) -> None:
-    """Raise AssertionError with `otherwise` where something does not hold."""
+    """Raise AssertionError with `otherwise` if something does not hold."""
     if not holds:
         raise AssertionError(otherwise)
 
@@ -223,7 +223,7 @@ def run(
     """Offer so many things to mappers in turn and return what was seen; a warning counts as an exception.
 
     seed: one number, or one of a run and one of a batch. alive: called before each call with the number of frames so
-    far; tells whether to go on.
+    far; reports whether to go on.
     """
     maker, rng, tally, number = Maker(seed, odd_cameras), np.random.default_rng(seed), Tally(), 0
     tried, shares = [Tried(kind) for kind in kinds], np.array([kind.share for kind in kinds])

@@ -177,7 +177,7 @@ def file_target(name: str, reader: Callable[[Path], Any], *seeds: str | bytes) -
 
 
 def frames_of(source: Any) -> None:
-    """Take the first frames; a fault is told in one line, and a frame without one has an image of its camera's size."""
+    """Take the first frames; a fault is reported in one line, and a frame without one has its camera's size."""
     for i in range(min(len(source), MAX_FRAMES)):
         frame = source.frame(i) if hasattr(source, "frame") else source[i]
         assert frame.fault_detail.isprintable(), "a fault of several lines"
@@ -617,7 +617,7 @@ def pose_texts(folder: Path) -> list[bytes]:
 
 
 def read_packed(name: str, data: bytes, folder: Path) -> None:
-    """A .sens, or a SLAMBench .raw with poses beside it."""
+    """A .sens, or a SLAMBench .raw with poses next to it."""
     (folder / "camera-intrinsics.txt").write_text("20 0 7.5\n0 21 5.5\n0 0 1\n")
     (folder / "p.txt").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(2)))
     (folder / name).write_bytes(data)

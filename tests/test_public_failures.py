@@ -70,7 +70,7 @@ def wall_of_points():
 
 
 def mapped(capsys, bag, out, *more):
-    """Map a bag by its odometry; return the result, what was told, and the floor's map."""
+    """Map a bag by its odometry; return the result, what was reported, and the floor's map."""
     result, said = run(capsys, "grid", bag, "--out", out, "--poses", "odometry", "--use", "lidar", *more)
     return result, said, read_map_server(out)
 
@@ -130,7 +130,7 @@ def test_an_image_whose_size_overflows_is_refused(tmp_path, capsys):
 
 
 def test_a_scan_of_infinities_marks_nothing(tmp_path, capsys):
-    """depthimage_to_laserscan#91 (+Inf passes into the scan): what each of them means is told and marks nothing.
+    """depthimage_to_laserscan#91 (+Inf passes into the scan): what each of them means is reported and marks nothing.
 
     +inf, and what is beyond range_max (Hokuyo writes range_max + 1 for "no echo"), is free; all others say nothing.
     """

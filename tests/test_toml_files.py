@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TOML beside a recording: what TOML allows and Python's floats or stack do not."""
+"""TOML next to a recording: what TOML allows and Python's floats or stack do not."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ class Mapper(Aged):
         self.map.close()
 
     def _packed(self, frame: Frame | Cloud, passed: GateResult) -> Packed | PackedCloud | None:
-        """Return the frame's depth image or cloud to be kept; None where it is not."""
+        """Return the frame's depth image or cloud to be kept; None if it is not."""
         kept = self.map.storage.kept
         return packed_of(frame) if kept is not None and kept.wants(passed.sensor, passed.seen) else None
 

@@ -185,7 +185,7 @@ def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
     """Return the depth images of a camera pair; poses they may have of their own are ignored.
 
     A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
-    source that recognises it, with its `depth_only(where)`. Raises SourceError where there are no depth images.
+    source that recognises it, with its `depth_only(where)`. Raises SourceError if there are no depth images.
     """
     from stereovox.sources.rigs.pair import CorrectedDepth
 
@@ -198,7 +198,7 @@ def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
 def open_robot(where: str | os.PathLike[str]) -> Robot:
     """Open the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
 
-    Raises SourceError where there is nothing, nothing known or nothing usable.
+    Raises SourceError if there is nothing, nothing known or nothing usable.
     """
     place = os.fspath(where)
     for name in registry.names("robots", ROBOTS):
@@ -232,7 +232,7 @@ def _depth_of(where: str) -> DepthSource:
 
 
 def _images_alone(where: str) -> DepthSource:
-    """Return depth images without poses; raises SourceError where there are none."""
+    """Return depth images without poses; raises SourceError if there are none."""
     for kind in _image_classes():
         if kind.recognises(where):
             return kind(where)
@@ -284,7 +284,7 @@ def _are_images(where: str, kinds: list[Any]) -> bool:
 
 
 def _inner(place: str, kinds: list[Any]) -> str:
-    """Name a recording or map that lies in a folder which is none itself, empty where there is none."""
+    """Name a recording or map that lies in a folder which is none itself, empty if there is none."""
     below = _below(place)
     likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
     if likely:
@@ -315,7 +315,7 @@ def _problem(where: str, kinds: list[Any]) -> str:
 
 
 def _below(folder: str) -> list[str]:
-    """Return folders in a folder, and those in these; raises OSError where it cannot be listed."""
+    """Return folders in a folder, and those in these; raises OSError if it cannot be listed."""
     inside = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir())[:MAX_BELOW]
     deeper = []
     for path in inside:
@@ -325,7 +325,7 @@ def _below(folder: str) -> list[str]:
 
 
 def file_cure(file: str) -> str:
-    """Say what a file is that is no recording, and name the cure, by its ending; empty where that says nothing."""
+    """Say what a file is that is no recording, and name the cure, by its ending; empty if that says nothing."""
     ending = os.path.splitext(file)[1].lower()
     if cure_of(file):
         return cure_of(file)
@@ -336,7 +336,7 @@ def file_cure(file: str) -> str:
 
 
 def _missing(folder: str, kinds: list[Any]) -> str:
-    """Say what the nearest layout has in `folder` and what it lacks, with the cure; empty where none is near."""
+    """Say what the nearest layout has in `folder` and what it lacks, with the cure; empty if none is near."""
     best, words = 0.0, ""
     for kind in kinds:
         parts: tuple[Part, ...] = getattr(kind, "parts", ())

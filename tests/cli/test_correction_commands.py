@@ -31,7 +31,7 @@ def maps(tmp_path_factory):
 
 
 def test_map_and_info_tell_of_kept_frames(tmp_path, told_with_notes, capsys):
-    """The same line, with their number and size; nothing where none are kept."""
+    """The same line, with their number and size; nothing if none are kept."""
     out, line = tmp_path / "m.svox", "keeps 8 of its frames, "
     words = ["map", "sim:room?image_width=96", "--frames", ":8", "--voxel-size", 0.2, "--out", out]
     assert "keeps" not in told_with_notes(*words)[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`describe` knows every kind of thing, gives the line to type, and ends in one line where there is nothing."""
+"""`describe` knows every kind of thing, gives the line to type, and ends in one line if there is nothing."""
 
 from __future__ import annotations
 

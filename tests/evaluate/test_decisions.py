@@ -56,7 +56,7 @@ def test_a_row_of_cells_by_hand():
     truth |= dict.fromkeys([(8, 0, 0), (11, 0, 0)], True)
     names = ["free", "free", "tentative", "free", "free", "free", "free", "occupied", "occupied", "occupied"]
     found = decisions(made_map({(x, 0, 0): name for x, name in enumerate(names)}), made_truth(truth))
-    # surfaces: 1 free beside a tentative cell, 5 free with nothing beside it, 8 occupied, 11 never seen
+    # surfaces: 1 free next to a tentative cell, 5 free with nothing next to it, 8 occupied, 11 never seen
     assert (found.surface, found.known, found.air, found.occupied, found.free) == (4, 3, 8, 3, 6)
     assert (found.surface_free, found.surface_free_alone, found.surface_unknown) == (0.5, 0.25, 0.25)
     assert (found.known_free, found.known_free_alone) == pytest.approx((2 / 3, 1 / 3))

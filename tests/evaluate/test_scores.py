@@ -93,7 +93,7 @@ def test_a_row_of_cells_by_hand():
     assert (found.observed.tp, found.observed.fp, found.observed.tn, found.observed.fn) == (1, 3, 1, 1)
     assert (found.accuracy, found.precision, found.recall) == pytest.approx((3 / 8, 1 / 4, 1 / 3))
     assert (found.specificity, found.npv, found.coverage) == pytest.approx((2 / 5, 1 / 2, 6 / 8))
-    assert found.tolerance_precision == pytest.approx(3 / 4)  # 1; 2 beside 1; 4 beside 5; not 3
+    assert found.tolerance_precision == pytest.approx(3 / 4)  # 1; 2 next to 1; 4 next to 5; not 3
     assert found.tolerance_recall == pytest.approx(2 / 3)  # 1; 5 by 4; not 7
     assert found.observed.tolerance_recall == pytest.approx(1)
     assert score(made(ours), made_truth(truth), tolerance=3).tolerance_recall == pytest.approx(1)  # 7 by 4

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cell sizes suggested for points: no holes in surfaces, steps of 1, 2 and 5, nothing where nothing can be known."""
+"""Cell sizes suggested for points: no holes in surfaces, steps of 1, 2 and 5, nothing if nothing can be known."""
 
 import numpy as np
 import pytest

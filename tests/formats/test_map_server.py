@@ -145,7 +145,7 @@ def test_what_map_saver_writes(tmp_path, negate, ending):
 
 
 def test_nav2_reads_ours_the_same(tmp_path):
-    """nav2_map_server scales by 100 and rounds: at most one per cent beside map_server's 99 that are cut off."""
+    """nav2_map_server scales by 100 and rounds: at most one per cent next to map_server's 99 that are cut off."""
     cells = np.arange(-1, 101, dtype=np.int8)[None]
     write_map_server(OccupancyGrid(cells, 0.05), tmp_path / "map.yaml", "scale")
     red, _, _, alpha = np.moveaxis(np.asarray(Image.open(tmp_path / "map.png")).astype(float)[0], 1, 0)
@@ -262,7 +262,7 @@ def test_missing_files_are_told(tmp_path):
     with pytest.raises(MapFileError, match=r"map\.pgm: no such file"):
         read_map_server(tmp_path / "map.pgm")
     (tmp_path / "map.pgm").write_bytes(b"P5 1 1 255 a")
-    with pytest.raises(MapFileError, match=r"map\.pgm: no map\.yaml beside it"):
+    with pytest.raises(MapFileError, match=r"map\.pgm: no map\.yaml next to it"):
         read_map_server(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text("a: 1\n")
     with pytest.raises(MapFileError, match=r"is not the \.yaml of a map_server map"):

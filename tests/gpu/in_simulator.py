@@ -74,7 +74,7 @@ def test_evidence_is_that_of_the_processor(model):
 def test_wholly_free_blocks_are_those_of_the_processor():
     image = image_of(2)
     upright = np.eye(4)
-    upright[:3, 3] = 0.1  # the second layer of blocks before it is nowhere beside the image
+    upright[:3, 3] = 0.1  # the second layer of blocks before it is nowhere next to the image
     image = sv.DepthImage(np.full_like(image.depth_m, np.inf), image.reason, SMALL, upright)
     evidence = assert_same_evidence(image, voxel_size=0.2, max_range=6.0, blind_range=3.0)
     assert len(evidence.uniform) > 2

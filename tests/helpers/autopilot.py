@@ -57,7 +57,7 @@ def px4(message):
 
 
 def ardupilot(message):
-    """Metres that ArduPilot reads for its 8 faces, None where there is nothing (AP_Proximity_MAV.cpp)."""
+    """Metres that ArduPilot reads for its 8 faces, None if there is nothing (AP_Proximity_MAV.cpp)."""
     faces = [None] * 8
     for j, cm in enumerate(message.distances):
         if cm in (0, 65535) or not message.min_distance <= cm <= message.max_distance:

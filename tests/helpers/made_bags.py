@@ -194,7 +194,7 @@ def add_t265(bag: Bag, recorded_ns: int, stamp_ns: int, numbers: Any, confidence
 
 
 def ros_bag(path: Path, count: int = 3, packed: str = "", topic: str = "/camera/depth/image_rect_raw") -> Path:
-    """An ordinary bag with 16UC1 images, camera_info beside them, and something that is none of our business."""
+    """An ordinary bag with 16UC1 images, camera_info next to them, and something that is none of our business."""
     with Bag(path, packed) as bag:
         bag.add("/chatter", "std_msgs/String", START_NS, text("hello"))
         for k in range(count):

@@ -31,7 +31,7 @@ def s3():
 
 @pytest.fixture(params=["folder", "s3"])
 def where(request, tmp_path):
-    """Return the name of a place where nothing is yet: in a folder, then in a bucket."""
+    """Return the name of a place if nothing is yet: in a folder, then in a bucket."""
     if request.param == "folder":
         return str(tmp_path / "city.svox")
     return f"{request.getfixturevalue('s3')}/{uuid4().hex}/city.svox"

@@ -55,7 +55,7 @@ def disk(folder, happens=lambda: None, at=0, ever=False):
 
 
 def small_map(frames):
-    """Return a map that tells how many frames it holds by its cells."""
+    """Return a map that reports how many frames it holds by its cells."""
     from stereovox.config import load_config
     from stereovox.maps import VoxelMap
 

@@ -57,7 +57,7 @@ class Merge:
 
 
 class Floor:
-    """A floor's map, in files beside each other; `write(n)` writes the n-th."""
+    """A floor's map, in files next to each other; `write(n)` writes the n-th."""
 
     def __init__(self, folder):
         self.out = folder / "out" / "floor.yaml"

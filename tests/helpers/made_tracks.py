@@ -60,7 +60,7 @@ def _cast(scene: Scene, T: Transform):
 
 
 def pictured(frames: Sequence[Frame], scene: Scene, seed: int = 0, contrast: float = 0.5, moving=None) -> list[Frame]:
-    """Return frames with a grey image each, of a camera beside the depth camera; `moving` as that of `seen`."""
+    """Return frames with a grey image each, of a camera next to the depth camera; `moving` as that of `seen`."""
     out = []
     for i, frame in enumerate(frames):
         other = moving(i) if moving else None

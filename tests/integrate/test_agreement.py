@@ -36,7 +36,7 @@ def shares_of(name, voxel_size, **settings):
 
 
 def check_the_same(shares):
-    """Rays clear each cell they cross, the projective map what a whole patch of pixels sees through: beside edges it
+    """Rays clear each cell they cross, the projective map what a whole patch of pixels sees through: next to edges it
     keeps a few occupied cells that rays clear, and loses none that they keep.
     """
     assert shares["precision"] >= 0.96, shares
@@ -69,7 +69,7 @@ def test_simulated_room(settings):
 @pytest.mark.parametrize("name", [pytest.param("kitchen", marks=kitchen), "room"])
 def test_what_the_share_of_the_footprint_changes(name):
     """Hits that fill little of a cell's footprint then count less than a ray does, so fewer cells are occupied, never
-    others: what is found is exact, and every cell that is left out lies beside one that is found.
+    others: what is found is exact, and every cell that is left out lies next to one that is found.
     """
     shares, in_full = shares_of(name, 0.1, **{"projective.full_share": 0.1}), shares_of(name, 0.1)
     assert shares["precision"] >= 0.97, shares

@@ -56,7 +56,7 @@ def test_projective_equals_its_reference(model, voxel_size):
 
 @pytest.mark.parametrize("model", SENSORS)
 def test_lone_far_pixels_mark_and_clear_as_in_the_reference(model):
-    """They clear nothing as wide as a patch, yet `andert` and `valenti` mark cells beside their points."""
+    """They clear nothing as wide as a patch, yet `andert` and `valenti` mark cells next to their points."""
     config = load_config(voxel_size=0.2, max_range=10.0, **{"sensor.model": model})
     camera = PinholeCamera.from_field_of_view(160, 120, 40, baseline=0.05)
     depth = np.full((120, 160), 0.7, np.float32)

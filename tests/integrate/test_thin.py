@@ -19,10 +19,10 @@ CASES = {
     "nearer than the camera sees": (Scene(0.020, 1.5, 2.0, 424, "d435", "approach", nearest=0.3), 0.05, {}),
 }
 LOST = {"half a pixel, flying": 0.05}
-"""Share of the layers that may be lost, where it is not 1 %: a case must not get worse."""
+"""Share of the layers that may be lost, if it is not 1 %: a case must not get worse."""
 FREE = dict.fromkeys(("half a pixel, exact", "half a pixel, tilted", "shaken poses", "noise, still"), 0.3)
 FREE |= {"half a pixel, flying": 0.15, "noise": 0.15}
-"""Share of the cells that a pole touches and that may be free, where it is not 5 %: some it only grazes."""
+"""Share of the cells that a pole touches and that may be free, if it is not 5 %: some it only grazes."""
 
 
 @pytest.mark.parametrize("name", CASES)

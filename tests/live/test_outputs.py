@@ -215,7 +215,7 @@ def test_images_without_a_pose_are_recorded_too(tmp_path):
     assert recorder.counts == {"images": 2, "unsuitable": 1}
     first, second = open_source(tmp_path / "log.mcap")
     assert not first.fault
-    assert second.pose_off_ns == 33 * MS  # nobody said where: the reader tells how far it had to guess
+    assert second.pose_off_ns == 33 * MS  # nobody said where: the reader reports how far it had to guess
 
 
 def test_pictures_are_recorded_with_their_place(tmp_path):

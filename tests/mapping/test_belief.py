@@ -104,7 +104,7 @@ FAULTY = {"fixed": FIXED, "restless": RESTLESS, "elsewhere": ELSEWHERE, "scaled"
 def test_time_alone_is_no_evidence(sight):
     told = Told(sight)
     assert told(*[0.03] * 30, *[0.6] * 300)[30:] == [DISAGREES] * 10 + [CONTRADICTS] * 290
-    assert told(None) == [CONTRADICTS]  # where nothing is known it is not believed either
+    assert told(None) == [CONTRADICTS]  # if nothing is known it is not believed either
     assert told(0.03, 0.03) == ["", ""]
     assert told.history.doubts == {}
 

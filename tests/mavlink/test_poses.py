@@ -213,7 +213,7 @@ def test_a_position_waits_for_the_attitude_after_it(quiet):
     assert taken.poses == []
     link.put(m.MAVLink_attitude_message(1_001_010, 0, 0, 0.2, 0, 0, 0))
     _, T, _ = taken.poses[0]
-    assert T[:3, 2] == pytest.approx([math.cos(0.1), -math.sin(0.1), 0])  # half way: yaw to the right is to -y
+    assert T[:3, 2] == pytest.approx([math.cos(0.1), -math.sin(0.1), 0])  # halfway: yaw to the right is to -y
     link.put(m.MAVLink_local_position_ned_message(1_001_020, 1, 2, 3, 0, 0, 0))
     link.put(m.MAVLink_attitude_message(1_001_500, 0, 0, 0.2, 0, 0, 0))  # half a second later says nothing of it
     assert len(taken.poses) == 1

@@ -16,7 +16,7 @@ RULES = SectorRules(max_distance=4.0)
 
 
 class Clock:
-    """A clock that only goes when it is told."""
+    """A clock that only goes when it is reported."""
 
     def __init__(self):
         self.ns = 10**12

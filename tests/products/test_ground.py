@@ -112,7 +112,7 @@ def test_a_pit_is_a_drop_and_its_rim_is_not():
 
 
 def test_a_ledge_beside_a_ramp_is_a_step():
-    """Both are ground, since a ramp leads up; where they lie beside one another, nobody drives across."""
+    """Both are ground, since a ramp leads up; where they lie next to one another, nobody drives across."""
     scene = Scene()
     scene.floor[10:, 10:] = np.minimum(np.arange(30) // 4, 5)[None]
     found = footing(scene)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work beside the node's thread: in order, or the newest alone, and nothing once it is dropped."""
+"""Work next to the node's thread: in order, or the newest alone, and nothing once it is dropped."""
 
 from threading import Event
 

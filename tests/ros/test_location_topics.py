@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of localisation: what AMCL of Nav2 publishes and listens to, and the error beside the map."""
+"""Messages of localisation: what AMCL of Nav2 publishes and listens to, and the error next to the map."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ PATIENCE_S = 60.0
 
 
 class Robot:
-    """A node, and beside it one that sends and listens."""
+    """A node, and next to it one that sends and listens."""
 
     def __init__(self, out: str):
         self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=60.0, out=out, **BY_TF)
@@ -409,6 +409,6 @@ def test_several_cameras_make_one_map(robot):
     centres = theirs.occupied()
     assert centres[:, 0].min() < -1.3  # what is behind
     assert centres[:, 0].max() > 1.25  # the pole ahead
-    assert (mine.state(centres) == 3).mean() > 0.98  # mounts are told in four digits
+    assert (mine.state(centres) == 3).mean() > 0.98  # mounts are reported in four digits
     robot.maker.close()
     other.destroy_node()

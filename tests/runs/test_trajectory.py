@@ -78,7 +78,7 @@ def test_pictures_that_are_not_used_are_told(tmp_path):
         (where / "rgb" / image.name).write_bytes(b"no picture")
     sv.track_recording(where, notify=lines.append)
     sv.map_recording(where, tmp_path / "a.svox", poses="track", notify=lines.append)
-    told = [line for line in lines if line.startswith("note: 4 of 4 pictures beside depth images are not used")]
+    told = [line for line in lines if line.startswith("note: 4 of 4 pictures next to depth images are not used")]
     assert len(told) == 2
 
 

@@ -22,7 +22,7 @@ PLAIN = RealisticDepthCamera(
 
 
 def disparity(device, depth, seed, T=None):
-    """Disparity in pixels, NaN where there is none."""
+    """Disparity in pixels, NaN if there is none."""
     millimetres, _ = device.measure(depth, seed, T)
     with np.errstate(divide="ignore"):
         return np.where(millimetres > 0, device.camera.fx * device.camera.baseline / (millimetres * 0.001), np.nan)

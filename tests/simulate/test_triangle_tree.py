@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first triangle that rays meet, beside all triangles in plain float64 (Moeller and Trumbore 1997)."""
+"""The first triangle that rays meet, next to all triangles in plain float64 (Moeller and Trumbore 1997)."""
 
 import os
 import subprocess

@@ -47,7 +47,7 @@ def test_the_pose_is_that_of_the_rectified_left_eye(tmp_path):
     first, second = open_source(asl(tmp_path))
     expected = TURNED @ FORWARD
     raw = first.T_world_sensor @ inverse(first.pair.T_body_camera) @ FORWARD
-    expected[0, 3] += 0.5  # half way from x = 0 to 1
+    expected[0, 3] += 0.5  # halfway from x = 0 to 1
     np.testing.assert_allclose(raw, expected, atol=1e-6)
     assert first.T_world_sensor[2, 2] == pytest.approx(0, abs=0.05), "the camera looks along the horizon: z is up"
     moved = second.T_world_sensor[:3, 3] - first.T_world_sensor[:3, 3]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""camera.toml: written, read, found beside recordings, put in the place of a source's own camera."""
+"""camera.toml: written, read, found next to recordings, put in the place of a source's own camera."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures beside depth images: decoding, which belongs to which, whose camera it is; by layout."""
+"""Pictures next to depth images: decoding, which belongs to which, whose camera it is; by layout."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,7 @@ def test_a_linear_problem_is_solved_as_numpy_solves_it(seed):
 
 
 def test_what_is_expected_counts_by_its_covariance():
-    """One measurement as good as the expectation, along z: the pose is half way."""
+    """One measurement as good as the expectation, along z: the pose is halfway."""
     A, doubt = np.zeros((1, 6)), np.diag([0.1, 0.1, 0.1, 0.2, 0.2, 0.05]) ** 2
     A[0, 5] = 1 / 0.04
     T, covariance = solve_stages([linear(A, np.array([0.1 / 0.04]))], EXPECTED, doubt)

@@ -140,7 +140,7 @@ def test_what_is_no_image_with_a_camera_is_left_out_and_told(spoil):
     frames = [replace(frame, photo=spoil(frame.photo)) for frame in pictured(seen(BAYS, aside(4)), BAYS)]
     tracker = Tracker()
     assert [bool(tracker.add(frame).lost) for frame in frames] == [True, False, False, False]
-    assert tracker.picture_use().startswith("4 of 4 pictures beside depth images are not used; the first: ")
+    assert tracker.picture_use().startswith("4 of 4 pictures next to depth images are not used; the first: ")
 
 
 def test_a_place_that_is_a_list_is_a_place():
@@ -148,7 +148,7 @@ def test_a_place_that_is_a_list_is_a_place():
     tracker = Tracker()
     for frame in frames:
         tracker.add(replace(frame, photo=replace(frame.photo, T_sensor_camera=frame.photo.T_sensor_camera.tolist())))
-    assert tracker.picture_use() == "4 pictures beside depth images are used"
+    assert tracker.picture_use() == "4 pictures next to depth images are used"
 
 
 def test_only_images_whose_pose_is_asked_for_are_counted_and_each_once():
@@ -159,7 +159,7 @@ def test_only_images_whose_pose_is_asked_for_are_counted_and_each_once():
         for _ in range(2):
             for other in frames:
                 tracker.expect(other)
-    assert tracker.picture_use() == "4 pictures beside depth images are used"
+    assert tracker.picture_use() == "4 pictures next to depth images are used"
 
 
 def test_images_narrower_than_a_corner_hold_nothing():

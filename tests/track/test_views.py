@@ -104,7 +104,7 @@ def test_poses_are_far_apart_by_metres_or_by_angle():
 
 
 def test_what_stands_where_views_looked_through_is_told_apart():
-    """A patch before a wall that was seen stands free; the wall, what is behind and what is beside do not."""
+    """A patch before a wall that was seen stands free; the wall, what is behind and what is next to do not."""
     wall = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-0.75, 0.75, 45)), -1).reshape(-1, 2)
     points = np.column_stack([wall, np.full(len(wall), 2.0)]).astype(np.float32)
     view = view_of(points, np.full(len(points), 0.005, np.float32), np.eye(4))

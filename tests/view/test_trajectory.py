@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of trajectories: both ways, where there is no pose, errors by length."""
+"""Pictures of trajectories: both ways, if there is no pose, errors by length."""
 
 import io
 

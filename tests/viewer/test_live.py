@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page beside a map in the making: whatever becomes of the page or its lookers, the mapping goes on."""
+"""A page next to a map in the making: whatever becomes of the page or its lookers, the mapping goes on."""
 
 import socket
 import struct

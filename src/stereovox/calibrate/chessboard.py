@@ -48,7 +48,7 @@ class Board:
 
 
 def find_corners(image: NDArray[np.uint8], board: Board) -> NDArray[np.float64] | None:
-    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None where it is not seen."""
+    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None if it is not seen."""
     import cv2
 
     size = (board.columns, board.rows)
@@ -70,7 +70,7 @@ def same_order(corners: NDArray[np.float64], other: NDArray[np.float64]) -> NDAr
 
 
 def read_grey(path: Path) -> NDArray[np.uint8] | None:
-    """Return the (height, width) uint8 image in `path`, None where there is none that OpenCV reads."""
+    """Return the (height, width) uint8 image in `path`, None if missing that OpenCV reads."""
     import cv2
     from PIL import Image
 
@@ -97,7 +97,7 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
     """Return name, left file and right file of each pair in `folder`, in order of name.
 
     Both files have the same name in folders `left` and `right`, or differ only in `left` and `right` or L and R.
-    Raises StereovoxError where there is no folder or no pair.
+    Raises StereovoxError if there is no folder or no pair.
     """
     where = Path(folder)
     if not where.is_dir():
@@ -124,7 +124,7 @@ def _eyes(where: Path) -> dict[str, dict[str, Path]]:
 
 
 def _side(path: Path) -> tuple[str, str]:
-    """Return `l` or `r` and what is the same in the name of the other eye's image; empty where it tells no eye."""
+    """Return `l` or `r` and what is the same in the name of the other eye's image; empty if it tells no eye."""
     if path.parent.name in ("left", "right"):
         return path.parent.name[0], path.stem
     found = SIDES.search(path.stem)

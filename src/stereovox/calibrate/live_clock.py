@@ -28,7 +28,7 @@ from stereovox.track.tracker import Tracker
 REASON = "clock_doubt"
 """Why images are refused whose clock may be wrong."""
 TELL_NS, REMIND_NS = 300_000_000, 10_000_000_000
-"""How long a doubt lasts until the user is told, and until the user is told again."""
+"""How long a doubt lasts until the user is reported, and until the user is reported again."""
 SAME_M, SAME_RAD, SAMPLES = 0.02, np.radians(0.5), 5
 """A body that moves by less between the two times that an image may be of, seen at so many times, rests."""
 BEFORE_NS, AFTER_NS = 500_000_000, 300_000_000
@@ -55,7 +55,7 @@ class PosesNow(Protocol):
         ...
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, None where there are fewer than two."""
+        """Return the poses of a stretch of time, None if there are fewer than two."""
         ...
 
 

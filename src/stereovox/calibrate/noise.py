@@ -36,13 +36,13 @@ class NoiseAt:
 
     rmse_m: root mean square error in metres, Chien's RMSE; its square is the sum of those of its two parts.
     temporal_m: what differs from frame to frame. fixed_m: what stays the same in all frames, 0 where it drowns in the
-    noise. Both are None where there is a single frame.
-    offset_m: how much too far the wall is seen, None where its distance was not measured.
+    noise. Both are None if there is a single frame.
+    offset_m: how much too far the wall is seen, None if its distance was not measured.
     valid_share: share of the region's pixels that have a value, of all frames; image_share: of the whole image.
     gross_share: share of the image's values that are gross errors; they are in no other figure.
     subpixel: the disparity error in pixels that makes rmse_m (Chien 2020, Eq 3.5), None without a baseline.
     correlation_px, falls_to_1_e_px, looks: how alike the errors of neighbouring pixels are, see `Correlation`; looks
-    are those in a patch of 8 x 8 pixels. grey: mean grey level of the pixels with a value, None where it is not known.
+    are those in a patch of 8 x 8 pixels. grey: mean grey level of the pixels with a value, None if it is not known.
     condition: in what light, with which emitter power or before which texture, in words.
     """
 
@@ -71,7 +71,7 @@ class ConditionNoise:
 
     distances_m: of the recordings. rmse_percent: root mean square over them of the error as a share of the depth.
     subpixel: the same of the disparity error in pixels, None without a baseline. valid_share, gross_share: means.
-    grey: mean grey level, None where no image is known.
+    grey: mean grey level, None if no image is known.
     """
 
     condition: str
@@ -89,7 +89,7 @@ class NoiseCalibration:
 
     subpixel: s2 * focal length * baseline in pixels, None without a baseline. worst_percent: by how much the curve
     misses a point at most. correlation_px: mean of the recordings'. conditions: in the order in which they were named,
-    empty where none was.
+    empty if none was.
     """
 
     s0: float
@@ -154,7 +154,7 @@ def calibrate_noise(
 
 
 def by_condition(recordings: Sequence[WallRecording], points: Sequence[NoiseAt]) -> tuple[ConditionNoise, ...]:
-    """Return the noise in each condition named by the recordings, in their order; empty where none is named."""
+    """Return the noise in each condition named by the recordings, in their order; empty if none is named."""
     named = list(dict.fromkeys(recording.condition for recording in recordings))
     return tuple(_condition(name, [p for p in points if p.condition == name]) for name in named) if any(named) else ()
 
@@ -179,7 +179,7 @@ def _condition(name: str, points: Sequence[NoiseAt]) -> ConditionNoise:
 def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> NoiseAt:
     """Return the noise within `region` (width, height in metres on the wall) round the optical axis.
 
-    Raises StereovoxError where there is no wall or where too few pixels of the region have depth.
+    Raises StereovoxError if there is no wall or where too few pixels of the region have depth.
     """
     camera = recording.camera
     wall = find_wall(recording.inverse, camera, recording.name)

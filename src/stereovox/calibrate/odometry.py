@@ -82,7 +82,7 @@ class CameraMotion:
 
     @property
     def steps(self) -> NDArray[np.float64]:
-        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN where it is not known."""
+        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN if it is not known."""
         T, reference = self.T_reference_camera, self.reference
         steps = np.full((max(len(T) - 1, 0), 4, 4), np.nan)
         for i in range(len(steps)):
@@ -193,14 +193,14 @@ class _Registration:
         self._target: Any = None
 
     def set_reference(self, points: NDArray[np.float64]) -> bool:
-        """Make these points the reference; return False where they are too few."""
+        """Make these points the reference; return False if they are too few."""
         if len(points) < MIN_POINTS:
             return False
         self._target = self._gicp.preprocess_points(points, CELL, num_neighbors=12)
         return True
 
     def against(self, points: NDArray[np.float64], guess: Transform) -> Link | None:
-        """Return where the points' camera stood in the reference's frame; None where that is not certain enough."""
+        """Return where the points' camera stood in the reference's frame; None if that is not certain enough."""
         if len(points) < MIN_POINTS:
             return None
         cloud, _ = self._gicp.preprocess_points(points, CELL, num_neighbors=12)

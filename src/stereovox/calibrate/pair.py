@@ -67,7 +67,7 @@ def calibrate_pair(
 
     poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
     `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
-    Raises StereovoxError where motion or depth do not suffice or the recordings do not overlap;
+    Raises StereovoxError if motion or depth do not suffice or the recordings do not overlap;
     MissingExtra without small_gicp.
     """
     motion = camera_motion(_clouds(depth, progress))
@@ -147,7 +147,7 @@ def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
 
 
 def check_turning(vectors: NDArray[np.float64]) -> None:
-    """Raise StereovoxError where (N, 3) rotation vectors are too small or all about one axis."""
+    """Raise StereovoxError if (N, 3) rotation vectors are too small or all about one axis."""
     weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
     first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
     if first < MIN_TURN:

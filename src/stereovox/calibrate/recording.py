@@ -88,7 +88,7 @@ def read_wall(
     matched: turns stereo frames into depth frames. condition: see `WallRecording`.
 
     The first frame tells where the wall is, and so what is a gross error.
-    Raises StereovoxError where not one frame has usable depth, and as `find_wall` where the first shows no wall.
+    Raises StereovoxError if not one frame has usable depth, and as `find_wall` if the first shows no wall.
     """
     wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)), condition=condition)
     expected, gross = None, GROSS
@@ -112,7 +112,7 @@ def read_wall(
 
 
 def metres(frame: Frame) -> NDArray[np.float32]:
-    """Return the depth as measured in metres, float32, NaN where there is none; poses and corrections do not count."""
+    """Return the depth as measured in metres, float32, NaN if there is none; poses and corrections do not count."""
     raw = np.asarray(frame.depth)
     depth_m = raw.astype(np.float32) * np.float32(frame.depth_scale)
     usable = np.isfinite(depth_m) & (depth_m > 0)

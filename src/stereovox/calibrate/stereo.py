@@ -33,7 +33,7 @@ Pixels = NDArray[np.float64]
 class BoardPair:
     """One pair of images.
 
-    left, right: (N, 2) pixels of the corners; None where no board was seen. why: the reason where it was dropped.
+    left, right: (N, 2) pixels of the corners; None if no board was seen. why: the reason where it was dropped.
     rms_px: root mean square of the distance from each corner to where calibration and board put it, both images.
     epipolar_px: RMS difference of the rows of a corner in both images after rectification; unseen_px: the same, from a
         calibration without this pair. NaN where it does not count.
@@ -112,7 +112,7 @@ def read_boards(folder: str | Path, board: Board, shown: Shown = iter) -> list[B
     """Return the pairs of images in `folder` with their corners; those without are marked with the reason.
 
     shown: is given the list of pairs and yields them one by one; it may tell a person how far they are.
-    Raises StereovoxError where there is no pair at all.
+    Raises StereovoxError if there is no pair at all.
     """
     pairs = [_with_corners(BoardPair(*names), board) for names in shown(image_pairs(folder))]
     sizes = [pair.size for pair in pairs if not pair.why]

@@ -49,7 +49,7 @@ class Fit:
 def fit_stereo(model: str, size: tuple[int, int], board: NDArray[np.float64], left: Corners, right: Corners) -> Fit:
     """Return lenses of `model` and their places from the corners of one board in each view.
 
-    size: width and height of the images. board: (N, 3) metres. Raises StereovoxError where nothing fits.
+    size: width and height of the images. board: (N, 3) metres. Raises StereovoxError if nothing fits.
     """
     lens_left, T_left = fit_lens(model, size, board, left)
     lens_right, T_right = fit_lens(model, size, board, right)

@@ -87,7 +87,7 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
     """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
 
     Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
-    this range, in seconds. Raises StereovoxError where no offset fits.
+    this range, in seconds. Raises StereovoxError if no offset fits.
     """
     _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
     _check_span("poses", track.times[-1])
@@ -143,7 +143,7 @@ def _frame_time(motion: CameraMotion) -> float:
 
 
 def _camera_speed(motion: CameraMotion) -> NDArray[np.float64]:
-    """Return the angular speed in rad/s each STEP from the first image on, NaN where it is not known."""
+    """Return the angular speed in rad/s each STEP from the first image on, NaN if it is not known."""
     times = (motion.stamps_ns - motion.stamps_ns[0]) / 1e9
     spans = np.diff(times)
     usual = (spans > 0) & (spans <= max(0.25, 3 * np.median(spans)))
@@ -187,7 +187,7 @@ def _correlate(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[
 
 
 def _peak(values: NDArray[np.float64], k: int) -> float:
-    """Return how far beside sample `k` the top of the parabola through it and its neighbours lies, in samples."""
+    """Return how far next to sample `k` the top of the parabola through it and its neighbours lies, in samples."""
     if not 0 < k < len(values) - 1:
         return 0.0
     left, middle, right = values[k - 1 : k + 2]

@@ -222,7 +222,7 @@ def residual(wall: Points, correction: DepthCorrection | None, plane: Array | No
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square of what is not NaN; infinite where nothing is left."""
+    """Return the root mean square of what is not NaN; infinite if nothing is left."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("inf")
 

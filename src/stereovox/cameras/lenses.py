@@ -153,7 +153,7 @@ class Lens:
         return np.where(np.abs(self._bent(angle) - radius) < 1e-9, angle, np.nan)
 
     def _undistorted(self, slopes: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the slopes x/z, y/z that appear at `plane`, by Newton's method; NaN where there are none."""
+        """Return the slopes x/z, y/z that appear at `plane`, by Newton's method; NaN if there are none."""
         with np.errstate(all="ignore"):
             for _ in range(ROUNDS):
                 missing = plane - self._distorted(slopes)
@@ -184,7 +184,7 @@ def _slope(polynomial: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _first_root(polynomial: NDArray[np.float64]) -> float:
-    """Return the smallest positive root of a polynomial (constant first), infinity where it has none."""
+    """Return the smallest positive root of a polynomial (constant first), infinity if it has none."""
     roots = np.roots(polynomial[::-1])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots.real))) & (roots.real > 0)]
     return float(real.min(initial=np.inf))

@@ -78,9 +78,9 @@ class StereoPair:
     Attributes:
         camera: The rectified left eye, with the baseline; the rectified right eye is the same camera, moved by the
             baseline along x.
-        eyes: The raw cameras that the images come from; None where images are rectified already.
+        eyes: The raw cameras that the images come from; None if images are rectified already.
         T_body_camera: (4, 4) maps the rectified left optical frame into the vehicle's (x forward, y left, z up).
-        valid: (height, width) bool of the rectified left image: False where parts of the vehicle block the view or the
+        valid: (height, width) bool of the rectified left image: False if parts of the vehicle block the view or the
             lens sees nothing; None: all pixels may be used.
         name: For messages.
         valid_right: As `valid`, for the rectified right image.

@@ -23,7 +23,7 @@ Doubts = Sequence[dict[str, Any]]
 
 
 def check_new(out: str, *inputs: str) -> None:
-    """Raise StereovoxError where no map can be saved to `out`, or it would overwrite one of its `inputs`."""
+    """Raise StereovoxError if no map can be saved to `out`, or it would overwrite one of its `inputs`."""
     from stereovox.maps.files.store import check_target
 
     if os.path.realpath(out) in map(os.path.realpath, inputs):
@@ -33,7 +33,7 @@ def check_new(out: str, *inputs: str) -> None:
 
 
 def name_beside(path: str, what: str) -> str:
-    """Return the name of a map made of another one, `NAME-what.svox` here. Raises StereovoxError where it is taken."""
+    """Return the name of a map made of another one, `NAME-what.svox` here. Raises StereovoxError if it is taken."""
     out = f"{Path(path).resolve().stem}-{what}.svox"
     if Path(out).exists():
         raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
@@ -71,7 +71,7 @@ def open_grid(path: str) -> OccupancyGrid:
 
 
 def check_not_map_image(file: str, path: str) -> None:
-    """Raise StereovoxError where writing `file` would overwrite the image with the cells of the map at `path`."""
+    """Raise StereovoxError if writing `file` would overwrite the image with the cells of the map at `path`."""
     from stereovox.formats.map_server import read_metadata
 
     own = [Path(path), Path(path).with_suffix(".png")]
@@ -82,7 +82,7 @@ def check_not_map_image(file: str, path: str) -> None:
 
 
 def check_new_floor(out: str, *inputs: str | Path) -> None:
-    """Raise StereovoxError where the picture or .yaml of a new floor map would overwrite one of its `inputs`."""
+    """Raise StereovoxError if the picture or .yaml of a new floor map would overwrite one of its `inputs`."""
     written = {os.path.realpath(Path(out).with_suffix(ending)) for ending in FLOOR_READABLE}
     if written & {os.path.realpath(file) for file in inputs}:
         raise StereovoxError(f"{out}: would overwrite what it is made of; give the new map another name")
@@ -117,7 +117,7 @@ def open_map(path: str) -> VoxelMap:
 
 
 def check_there(path: str) -> None:
-    """Raise MapFileError where `path` is no map: one line that suggests the map or recording likely meant."""
+    """Raise MapFileError if `path` is no map: one line that suggests the map or recording likely meant."""
     from stereovox.maps.files.store import is_map
 
     if not is_map(path):

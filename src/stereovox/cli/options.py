@@ -98,7 +98,7 @@ def add_checkpoint(parser: ArgumentParser) -> None:
 
 
 def check_ending(option: str, file: str | None, *endings: str) -> None:
-    """Raise StereovoxError where the file of an option does not have one of these suffixes."""
+    """Raise StereovoxError if the file of an option does not have one of these suffixes."""
     if file is not None and Path(file).suffix.lower() not in endings:
         raise StereovoxError(f"{option} {file}: end the file's name with {' or '.join(endings)}")
 

@@ -43,7 +43,7 @@ def open_noting(name: str) -> Robot:
 
 
 def print_trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
-    """Print and return the error of the trajectory; empty where the true one is not known."""
+    """Print and return the error of the trajectory; empty if the true one is not known."""
     if robot.truth is None:
         return {}
     from stereovox.evaluate.trajectory import trajectory

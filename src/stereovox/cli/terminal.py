@@ -74,7 +74,7 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
-    """Yield `items` with a progress bar; `total` is None where their number is unknown."""
+    """Yield `items` with a progress bar; `total` is None if their number is unknown."""
     with progress_of(total, text) as bar:
         for item in items:
             yield item
@@ -91,7 +91,7 @@ def progress_of_steps(text: str) -> Iterator[Callable[[int, int, str], None]]:
 
 @contextmanager
 def progress_of(total: int | None, text: str) -> Iterator[FrameProgress]:
-    """Yield an observer that draws a progress bar; `total` is None where the number of frames is unknown."""
+    """Yield an observer that draws a progress bar; `total` is None if the number of frames is unknown."""
     with progress_bar() as bar:
         yield FrameProgress(bar, bar.add_task(text, total=total, note=""))
 

@@ -53,7 +53,7 @@ class Config(Section):
             without a window, `max_memory`, `map.keep_times`, `map.keep_frames` or `sphere`. Without such a card it is
             `cpu`, and a line says so.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
-        deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
+        deadline_ms: Milliseconds a frame may take; `pace` sets what is left out if frames take longer. Not set:
             no limit.
         max_memory: Bytes that the cells may take, as a number or like "500 MB".
         when_full: Frames that need more memory are refused (`refuse`); or the map is a window of that size round the

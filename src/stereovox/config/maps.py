@@ -14,7 +14,7 @@ MAX_WINDOW = 1e6
 
 
 class SensorConfig(BaseModel):
-    """The inverse sensor model by name, and its own parameters beside it (`p_free`, ...).
+    """The inverse sensor model by name, and its own parameters next to it (`p_free`, ...).
 
     model: `stereo`, `constant`, `andert`, `valenti`, or one that another package registers.
     """
@@ -31,8 +31,8 @@ class RayConfig(Section):
     """How the integrators `ray` and `line` combine the rays of a frame.
 
     update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). That
-        counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays beside it
-        and becomes free.
+        counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays next to
+        it and becomes free.
     """
 
     update: Literal["every", "once"] = "once"

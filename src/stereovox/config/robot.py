@@ -80,7 +80,7 @@ class AmclConfig(Section):
     beam_skip: leave out beams that most particles find in the open, once they agree with each other: people, and what
         was moved.
     beam_skip_distance: a beam fits a particle for which it ends within so many metres of an obstacle.
-    beam_skip_share: a beam is left out where it fits a smaller share of the particles.
+    beam_skip_share: a beam is left out if it fits a smaller share of the particles.
     beam_skip_most: all beams are used where a larger share of them would be left out.
     alpha_slow, alpha_fast: decay rates of the long and the short average of the likelihood (table 8.3); where the
         short one falls below the long one, random particles help to find the robot again. 0: never.

@@ -46,10 +46,10 @@ class LoopClosure:
         refused: Places that look the same and were not believed to be, and why.
         anchors: (S,) int64, numbers of the frames in the middle of all places.
         report: What the correction did to the map.
-        odometry: The second odometry, and for how many steps it was of use; None where there is none.
-        positions: The positions that do not drift, and in how many places they are agreed with; None where there are
+        odometry: The second odometry, and for how many steps it was of use; None if missing.
+        positions: The positions that do not drift, and in how many places they are agreed with; None if there are
             none.
-        sensors: Which sensor took each of the N frames; empty where there is but one.
+        sensors: Which sensor took each of the N frames; empty if there is but one.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -162,7 +162,7 @@ def close_loops(
             qy qz qw` (TUM; rotations are not used) in metres, in any world with the same way up, or a bag with
             `sensor_msgs/NavSatFix` (where there are several topics: `drive.bag?topic=/gps/fix`).
         positions_sigma: Their standard deviation in metres, along each axis.
-        odometry: A second odometry beside the map's poses, such as that of wheels: a file of such lines (TUM) with the
+        odometry: A second odometry next to the map's poses, such as that of wheels: a file of such lines (TUM) with the
             poses of the camera in any world; `loops.odometry_drift` says how far it drifts.
         progress: Called with how many are done, how many there are, and what is being done.
         **overrides: Settings of `loops`, such as `**{"loops.drift": 0.05}` for poses that drift more than usual.
@@ -192,7 +192,7 @@ def close_loops(
 
 
 def refuse_without_frames(overrides: Mapping[str, Any]) -> None:
-    """Raise StereovoxError where settings say that no frames are kept."""
+    """Raise StereovoxError if settings say that no frames are kept."""
     if overrides.get("map.keep_frames") is False:
         raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
 
@@ -222,7 +222,7 @@ def close(
         mapper: Its map must keep its frames (`map.keep_frames`).
         progress: Called with how many are done, how many there are, and what is being done.
         positions: Positions of the camera that do not drift.
-        odometry: A second odometry beside the frames' poses.
+        odometry: A second odometry next to the frames' poses.
 
     Returns:
         What was found and done.

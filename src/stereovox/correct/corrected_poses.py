@@ -119,7 +119,7 @@ class OdometryJumps:
     """Notices that another program has moved odometry's frame in the map, and finds out where frames belong by that.
 
     A jump says by how much the pose of a camera was wrong in the end, and not how that came about. It is spread over
-    the way since the last jump: a frame half way is moved half as far. This is an approximation; a path of corrected
+    the way since the last jump: a frame halfway is moved half as far. This is an approximation; a path of corrected
     poses (`poses_by_path`) is exact. Frames afterwards have the new transform by themselves.
 
     Args:
@@ -267,7 +267,7 @@ def _beside(stamps_ns: Sequence[int], stamp_ns: int) -> set[int]:
 
 
 def _where(frames: Sequence[KeptFrame], stamp_ns: int) -> Transform | None:
-    """Return where a sensor was at a time between two of its frames, in order; None where one is 0.1 s or more away,
+    """Return where a sensor was at a time between two of its frames, in order; None if one is 0.1 s or more away,
     or so near that another pose, which is nearer, is its own.
     """
     after = bisect_left(frames, stamp_ns, key=lambda frame: frame.stamp_ns)

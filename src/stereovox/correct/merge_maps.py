@@ -127,7 +127,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     Args:
         a: A map, whose settings the result has.
         b: Another map.
-        T_a_b: (4, 4), maps the world frame of `b` into that of `a`; None where they are the same.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a`; None if they are the same.
 
     Returns:
         An unbounded map.
@@ -143,7 +143,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
 
 
 def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str | None:
-    """Return why two maps are merged by adding up, which is not exact; None where they are merged by their frames.
+    """Return why two maps are merged by adding up, which is not exact; None if they are merged by their frames.
 
     Args:
         a: A map.
@@ -167,7 +167,7 @@ def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str |
 def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
     """Return how many kept frames two maps have in common; `merge` counts them once.
 
-    Raises StereovoxError where a map did not keep its frames.
+    Raises StereovoxError if a map did not keep its frames.
     """
     ours, theirs = ({_identity(frame) for frame in need_frames(one.kept_frames, "a map").frames} for one in (a, b))
     return len(ours & theirs)

@@ -124,7 +124,7 @@ def _median_and_most(numbers: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _posed_sensor(frames: Sequence[KeptFrame], sensor: str | None, path: str | Path) -> str:
-    """Return the sensor that the poses are of. Raises StereovoxError where that is not clear."""
+    """Return the sensor that the poses are of. Raises StereovoxError if that is not clear."""
     names = sorted({frame.sensor for frame in frames})
     if (sensor is None and len(names) > 1) or (sensor is not None and sensor not in names):
         given = "which one the poses are of" if sensor is None else f"another name than '{sensor}'"

@@ -139,7 +139,7 @@ def _write(inverse, margin, noise, fine, low, high, depths):
 
 @cell
 def _average(above, row, below, step, margin, noise, fine, wide, limit, out, noisy):
-    """Average the pixels of a row with those `step` beside them, and in the rows above and below; margins stay."""
+    """Average the pixels of a row with those `step` next to them, and in the rows above and below; margins stay."""
     for start in range(margin, np.uintp(row.size) - margin, np.uintp(SEGMENT)):
         takes_part = _any_noisy(row, start, noise, fine)
         noisy[_segment(start, margin)] = takes_part

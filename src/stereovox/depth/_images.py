@@ -17,7 +17,7 @@ CHUNK = 4096
 def classify(raw, scale, min_range, max_range, none, infinite, given, far, depth_m, reason):
     """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
 
-    none: a raw value that means "no value" beside zero, negative ones and NaN (65535 in uint16 images). -inf is too
+    none: a raw value that means "no value" next to zero, negative ones and NaN (65535 in uint16 images). -inf is too
     near. infinite: what +inf means: itself (too far), or NaN (unknown). given: the source's own reasons, which come
     first; empty: it has none. far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or too
     near, contradicts it.
@@ -75,7 +75,7 @@ def _reasons_given(given, far, depth_m, reason):
 
 @cell
 def _choose(condition, a, b):
-    """Return `a` where the condition holds, else `b`, without a branch."""
+    """Return `a` if the condition holds, else `b`, without a branch."""
     mask = np.int32(-np.int32(condition))
     return np.int32((a & mask) | (b & ~mask))
 

@@ -68,7 +68,7 @@ def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, b
 
     Also its slope (rise per metre along the floor), and the distance up to which nothing is measured on it.
 
-    The hit is -inf where something too near may be in the band, inf where there is none. The floor right in front
+    The hit is -inf where something too near may be in the band, inf if there is none. The floor right in front
     of the camera is too near as well, but no obstacle: rays that would meet it there are ignored. An ignored ray, one
     that is too steep and one that looks back are free up to 0.
     """

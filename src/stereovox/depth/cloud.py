@@ -83,7 +83,7 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
     Args:
         cloud: Its points are where the sensor saw them when it measured each.
         times_s: (N,) seconds from `stamp_ns` at which each was measured.
-        pose_at: Returns T_world_sensor (4, 4) at a time in nanoseconds; FrameRefused where it is not known.
+        pose_at: Returns T_world_sensor (4, 4) at a time in nanoseconds; FrameRefused if it is not known.
 
     Returns:
         The cloud with its points in the sensor's frame at `stamp_ns`, and with `origins`. Points with a time that is
@@ -117,7 +117,7 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
 
 
 def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
-    """Return points (N, 3) of a field as float64; none where it is None."""
+    """Return points (N, 3) of a field as float64; none if it is None."""
     given = getattr(cloud, field)
     if given is None:
         return np.empty((0, 3))

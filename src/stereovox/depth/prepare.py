@@ -52,7 +52,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     """Return the frame's depth image in metres, corrected where its camera has a `correction`.
 
     A pixel is UNKNOWN where the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
-    [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
+    [min_range, max_range], TOO_NEAR also if it is -inf. The source's own reason, where it has one, comes first; but
     its TOO_FAR only where neither a depth at the pixel nor the frame's `farthest` contradicts it. `depth.far` sets
     which sources of "too far" count.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,

@@ -53,7 +53,7 @@ TINY_M, BEAM_SIGMA_M = 1e-6, 0.03
 
 
 def check_depth(image: DepthImage, frame: Frame, config: Config) -> None:
-    """Raise FrameRefused where the depth image of `frame` shows no surfaces: `too_few_values`, `no_surfaces`."""
+    """Raise FrameRefused if the depth image of `frame` shows no surfaces: `too_few_values`, `no_surfaces`."""
     looked, informative, compared, even = counted(image, config)
     if informative < config.trust.min_valid_share * looked:  # of the sampled rows; now count all
         _check_share(image, frame, config.trust.min_valid_share)
@@ -85,7 +85,7 @@ def _check_share(image: DepthImage, frame: Frame, least: float) -> None:
 
 
 def check_unit(frame: Frame, depth_m: NDArray[np.floating], config: Config) -> None:
-    """Raise FrameRefused `bad_units` where the depths (N,) of a frame, in metres, cannot be metres."""
+    """Raise FrameRefused `bad_units` if the depths (N,) of a frame, in metres, cannot be metres."""
     found = _wrong_unit(depth_m, max(FAR_RANGES * config.max_range, FAR_M), config)
     if found:
         cure = "millimetres? give depth_scale=0.001" if found[1] == "beyond" else "metres already? give depth_scale=1"
@@ -94,7 +94,7 @@ def check_unit(frame: Frame, depth_m: NDArray[np.floating], config: Config) -> N
 
 
 def check_unit_of_rays(seen: Cloud | Scan, lengths_m: NDArray[np.floating], config: Config) -> None:
-    """Raise FrameRefused `bad_units` where the lengths (N,) of a lidar's rays, in metres, cannot be metres."""
+    """Raise FrameRefused `bad_units` if the lengths (N,) of a lidar's rays, in metres, cannot be metres."""
     found = _wrong_unit(lengths_m, max(2 * config.max_range, FAR_LIDAR_M), config)
     if found:
         cure = "millimetres? multiply by 0.001" if found[1] == "beyond" else "kilometres? multiply by 1000"
@@ -103,7 +103,7 @@ def check_unit_of_rays(seen: Cloud | Scan, lengths_m: NDArray[np.floating], conf
 
 
 def _wrong_unit(lengths_m: NDArray[np.floating], farthest_m: float, config: Config) -> tuple[float, str] | None:
-    """Return the median of lengths (N,) where it cannot be in metres, and whether it is `beyond` or `below` that."""
+    """Return the median of lengths (N,) if it cannot be in metres, and whether it is `beyond` or `below` that."""
     known = lengths_m[np.isfinite(lengths_m) & (lengths_m > 0)]
     if not known.size:
         return None
@@ -115,7 +115,7 @@ def _wrong_unit(lengths_m: NDArray[np.floating], farthest_m: float, config: Conf
 
 
 def check_cloud(checked: CheckedCloud, cloud: Cloud, config: Config) -> None:
-    """Raise FrameRefused where a checked cloud shows too little, or no surfaces: `too_few_values`, `no_surfaces`."""
+    """Raise FrameRefused if a checked cloud shows too little, or no surfaces: `too_few_values`, `no_surfaces`."""
     given = len(cloud.points) + (0 if cloud.clear is None else len(cloud.clear))
     _check_number(cloud, len(checked.ends), given, "points", config)
     if config.trust.min_surface_share:
@@ -133,7 +133,7 @@ def checked_scan(scan: Scan, config: Config) -> Scan:
 
 
 def check_scan(scan: Scan, config: Config) -> None:
-    """Raise FrameRefused where a validated scan of a lidar cannot be true.
+    """Raise FrameRefused if a validated scan of a lidar cannot be true.
 
     The reason is `bad_units`, `no_valid_range`, `too_few_values`, or `no_surfaces`.
     """
@@ -164,7 +164,7 @@ def _check_number(seen: Cloud | Scan, number: int, of: int, what: str, config: C
 
 
 def _check_alike(seen: Cloud | Scan, alike: Callable[[int], float], config: Config) -> None:
-    """Raise FrameRefused `no_surfaces` where too few ranges are like those next to them.
+    """Raise FrameRefused `no_surfaces` if too few ranges are like those next to them.
 
     alike: returns the share of them, 0 to 1, among so many rays.
     """
@@ -214,7 +214,7 @@ def _alike(
 
 
 def check_light(frame: StereoFrame, limit: float) -> None:
-    """Raise FrameRefused where more than the share `limit` of an image is black or saturated.
+    """Raise FrameRefused if more than the share `limit` of an image is black or saturated.
 
     The reason is `too_dark` or `overexposed`.
     """

@@ -48,8 +48,8 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen,
     and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
 
-    Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
-    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
+    Raises FrameRefused: `camera_tilted` if no row looks level (method `rows`), `camera_vertical` if the camera
+    looks straight up or down, `heights_not_seen` if no ray meets the heights; ConfigError if z is not up.
     """
     if config.up.removeprefix("+") != "z":
         raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
@@ -147,7 +147,7 @@ def rays_of(camera: VirtualCamera) -> Rays:
 def levelled(image: DepthImage) -> tuple[NDArray[np.float64], float]:
     """Return the rotation (3, 3) from the optical frame to forward, left, up, and the yaw of forward in the world.
 
-    Raises FrameRefused `camera_vertical` where the camera looks so steeply that there is no forward.
+    Raises FrameRefused `camera_vertical` if the camera looks so steeply that there is no forward.
     """
     R = image.T_world_sensor[:3, :3]
     ahead = R[:, 2]
@@ -165,7 +165,7 @@ def levelled(image: DepthImage) -> tuple[NDArray[np.float64], float]:
 def level_rows(image: DepthImage, rays: Rays, turn: NDArray[np.float64], number: int, off_level_deg: float) -> slice:
     """Return `number` rows round the one that looks level, fewer at the image's border.
 
-    Raises FrameRefused `camera_tilted` where a ray of that row is more than `off_level_deg` off the level.
+    Raises FrameRefused `camera_tilted` if a ray of that row is more than `off_level_deg` off the level.
     """
     forward, _, up = turn @ np.column_stack([np.zeros(len(rays.rows)), rays.rows]).T
     middle = int(np.argmin(np.where(forward > 0, np.abs(np.arctan2(up, forward)), np.inf)))
@@ -201,7 +201,7 @@ def directions(rays: Rays, turn: NDArray[np.float64], step: float) -> tuple[Dire
 def check_heights(
     image: DepthImage, rays: Rays, turn: NDArray[np.float64], heights: tuple[float, float], far: float, at: float
 ) -> None:
-    """Raise FrameRefused `heights_not_seen` where no ray is within `heights` before `far` metres of depth.
+    """Raise FrameRefused `heights_not_seen` if no ray is within `heights` before `far` metres of depth.
 
     at: height of the camera above the floor in metres.
     """
@@ -255,7 +255,7 @@ def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
 
 
 def nearest(image: DepthImage) -> float:
-    """Return about the least depth in metres in the image (its 1st percentile); 0 where it has none.
+    """Return about the least depth in metres in the image (its 1st percentile); 0 if it has none.
 
     The camera's own nearest depth may be larger than `min_range`, without being reported.
     """

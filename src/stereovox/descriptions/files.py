@@ -189,7 +189,7 @@ def describe_image(path: str) -> Description | None:
         facts["values"] = [low, middle, high]
         lines.append(f"90 % of the values lie from {low:.6g} to {high:.6g}; half of them are below {middle:.6g}")
         lines.append(_unit_line(middle, depth.dtype == np.uint16))
-    lines.append("one image makes no map: put the images into depth/ with a file of poses beside it")
+    lines.append("one image makes no map: put the images into depth/ with a file of poses next to it")
     folder = os.path.dirname(os.path.abspath(path))
     return Description("depth image", lines, facts, [command_line("info", folder)])
 
@@ -207,7 +207,7 @@ def _unit_line(middle: float, whole: bool) -> str:
 
 
 def _picture(path: str, refused: str) -> Description:
-    """Describe a picture that was refused as a depth image; raises SourceError where it is none."""
+    """Describe a picture that was refused as a depth image; raises SourceError if it is none."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -222,7 +222,7 @@ def _picture(path: str, refused: str) -> Description:
         "stereovox maps depth images, or pairs of pictures of a calibrated stereo camera, with poses",
     ]
     if mode == "L":
-        lines.append(f"if it is the map of a floor, its {Path(path).stem}.yaml is missing beside it")
+        lines.append(f"if it is the map of a floor, its {Path(path).stem}.yaml is missing next to it")
     folder = os.path.dirname(os.path.abspath(path))
     facts = {"kind": "picture", "width": width, "height": height, "mode": mode}
     return Description("picture", lines, facts, [command_line("info", folder)])

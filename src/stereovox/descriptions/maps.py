@@ -62,7 +62,7 @@ def describe_map(path: str) -> Description | None:
 
 
 def _refuse_manifest(path: Path) -> None:
-    """Raise MapFileError where a map is named by its manifest, which has numbers as calibrations have them."""
+    """Raise MapFileError if a map is named by its manifest, which has numbers as calibrations have them."""
     if path.name == MANIFEST and path.is_file() and FORMAT.encode() in read_part(path, 0, 100):
         raise MapFileError(
             f"{path}: is a file of a map, which is the folder; type: {command_line('info', path.parent)}"
@@ -110,7 +110,7 @@ def describe_floor(path: str) -> Description | None:
 
 
 def _has_metadata(path: Path) -> bool:
-    """Return whether a file is a map_server .yaml, or an image with one beside it."""
+    """Return whether a file is a map_server .yaml, or an image with one next to it."""
     if path.suffix.lower() in (".yaml", ".yml"):
         try:
             return {b"image", b"resolution"} <= set(

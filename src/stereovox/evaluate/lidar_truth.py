@@ -203,7 +203,7 @@ def lidar_truth(
     same cell: one point is enough.
     frames: which frames, as `A:B:S` or numbers; None: all. Their images are not read. watch(numbers, count) yields the
     numbers again, for a progress bar.
-    Raises SourceError where the source has no lidar or not one scan can be used, StereovoxError for bad values.
+    Raises SourceError if the source has no lidar or not one scan can be used, StereovoxError for bad values.
     """
     if free not in FREE:
         raise StereovoxError(f"free '{free}' is not known; say {' or '.join(FREE)}")
@@ -252,7 +252,7 @@ class _Truth:
         self._last = viewpoint
 
     def map(self) -> VoxelMap:
-        """Return the map; raises SourceError where not one scan could be used."""
+        """Return the map; raises SourceError if not one scan could be used."""
         counts = self.counts
         if not counts.frames:
             raise SourceError(f"{self.source.name}: not one lidar scan can be used ({counts.first_refusal})")

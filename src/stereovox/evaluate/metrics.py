@@ -15,11 +15,11 @@ from stereovox.maps import State, VoxelMap
 
 MIN_SHARE = 0.9
 MAX_GAP = 0.1
-"""A piece is missing where a smaller share of its seen cells is found, or a gap is longer (in metres)."""
+"""A piece is missing if a smaller share of its seen cells is found, or a gap is longer (in metres)."""
 
 
 def ratio(part: float, whole: float) -> float | None:
-    """Return part / whole, None where the whole is zero."""
+    """Return part / whole, None if the whole is zero."""
     return float(part / whole) if whole else None
 
 

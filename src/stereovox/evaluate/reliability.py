@@ -72,7 +72,7 @@ def brier(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> float | None:
 def correlation(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> float | None:
     """Return Pearson's correlation of p (N,) and actual (N,) (Valenti 2018, Eq 8.8-8.9, its sum divided by N).
 
-    None where one of the two does not vary.
+    None if one of the two does not vary.
     """
     share = float(actual.mean()) if len(p) else 0.0
     ours = p - p.mean() if 0 < share < 1 else np.zeros(1)

@@ -195,7 +195,7 @@ class TruthCells:
     def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
         """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
 
-        Raises StereovoxError where none is chosen.
+        Raises StereovoxError if none is chosen.
         """
         if not chosen.any():
             raise StereovoxError("no cell of the truth lies in this part of it; choose a larger one")
@@ -210,7 +210,7 @@ class TruthCells:
         return position(self.cells, around) >= 0
 
     def read(self, voxel_map: VoxelMap) -> Reading:
-        """Read `voxel_map`. Raises StereovoxError where its cells are not those of the truth."""
+        """Read `voxel_map`. Raises StereovoxError if its cells are not those of the truth."""
         voxel_map = in_cubes(voxel_map)
         if not np.allclose(voxel_map.voxel_size, self.voxel_size, rtol=1e-5, atol=0):
             raise StereovoxError(

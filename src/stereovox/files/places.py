@@ -62,7 +62,7 @@ class Place(ABC):
 
     @abstractmethod
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what a file holds, None where there is none. Raises MapFileError for one of more than `most` bytes."""
+        """Return what a file holds, None if missing. Raises MapFileError for one of more than `most` bytes."""
 
     @abstractmethod
     def write(self, name: str, data: bytes) -> None:
@@ -74,7 +74,7 @@ class Place(ABC):
 
     @abstractmethod
     def create(self, name: str, data: bytes) -> bool:
-        """Write a file as `write` does where there is none; return False, and change nothing, where there is one.
+        """Write a file as `write` does if there is none; return False, and change nothing, where there is one.
 
         Of several processes that try at the same moment one succeeds.
         """
@@ -88,7 +88,7 @@ class Place(ABC):
         """Remove files, each there or not."""
 
     def read(self, name: str, most: int = MAX_FILE) -> bytes:
-        """Return what a file holds. Raises MapFileError where there is none, or one of more than `most` bytes."""
+        """Return what a file holds. Raises MapFileError if there is none, or one of more than `most` bytes."""
         data = self.find(name, most)
         if data is None:
             raise MapFileError(f"{self}/{name}: is not there; what it belongs to is damaged, make it anew")
@@ -122,7 +122,7 @@ class Folder(Place):
         return Folder(self._path(name))
 
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what a file holds, None where there is none; links are not followed."""
+        """Return what a file holds, None if missing; links are not followed."""
         path = self._path(name)
         with _one_line(path, "read"):
             if path.is_symlink():
@@ -133,18 +133,18 @@ class Folder(Place):
                 return None
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file beside its place and rename it."""
+        """Write a file next to its place and rename it."""
         self.write_all({name: data})
 
     def write_all(self, files: dict[str, bytes]) -> None:
-        """Write files beside their places and rename them; each folder is flushed once."""
+        """Write files next to their places and rename them; each folder is flushed once."""
         for name, data in files.items():
             with self._unfinished(name, data) as (temporary, path):
                 temporary.replace(path)
         self._flush(files)
 
     def create(self, name: str, data: bytes) -> bool:
-        """Write a file where there is none: a second name for a whole file, which the system gives only once."""
+        """Write a file if there is none: a second name for a whole file, which the system gives only once."""
         with self._unfinished(name, data) as (temporary, path):
             try:
                 os.link(temporary, path)
@@ -225,7 +225,7 @@ class Bucket(Place):
         return Bucket(f"{self.url}/{_checked(self, name)}")
 
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what an object holds, None where there is none."""
+        """Return what an object holds, None if missing."""
         with self._one_line(name):
             try:
                 got = self._store.get(_checked(self, name))

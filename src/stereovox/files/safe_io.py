@@ -60,7 +60,7 @@ MAX_NUMBER = 1e300
 
 
 def check_in_space(out: str | Path) -> None:
-    """Raise StereovoxError where a 3-D map would be given the file name of a 2-D map."""
+    """Raise StereovoxError if a 3-D map would be given the file name of a 2-D map."""
     if Path(out).suffix.lower() in FLOOR_READABLE:
         raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
 
@@ -71,13 +71,13 @@ def is_url(where: str | os.PathLike[str]) -> bool:
 
 
 def check_local(out: str | Path, error: type[StereovoxError] = StereovoxError) -> None:
-    """Raise `error` where a file or folder that can only be local is named as a URL, also by a path made of one."""
+    """Raise `error` if a file or folder that can only be local is named as a URL, also by a path made of one."""
     if is_url(url := str(Path(out)).replace(":/", "://", 1)):  # a path has one slash where a URL has two
         raise error(f"{url}: only maps in boxes can lie in an object store (fleet); choose a local name")
 
 
 def check_file(out: str | Path, endings: Iterable[str]) -> Path:
-    """Return `out` as a path. Raises StereovoxError, before any work, where it cannot be written."""
+    """Return `out` as a path. Raises StereovoxError, before any work, if it cannot be written."""
     check_local(out)
     path = Path(out)
     if path.suffix.lower() not in endings:
@@ -100,7 +100,7 @@ def check_folder(folder: Path, name: str) -> None:
 def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> Iterator[IO[bytes]]:
     """Yield a binary file that replaces `path` when the block ends without error; otherwise `path` is unchanged.
 
-    Raises `error` where the folder is missing or cannot be written, the disk is full, or the name is a URL.
+    Raises `error` if the folder is missing or cannot be written, the disk is full, or the name is a URL.
     """
     check_local(path, error)
     target = Path(os.path.realpath(path))  # a symbolic link stays one
@@ -163,7 +163,7 @@ def sync_tree(folder: Path) -> None:
 
 
 def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
-    """Return the bytes of a file. Raises OSError where it cannot be read, holds more than `most`, or is no plain file.
+    """Return the bytes of a file. Raises OSError if it cannot be read, holds more than `most`, or is no plain file.
 
     Pipes would block, and devices never end.
     """
@@ -263,7 +263,7 @@ def count_in(table: dict[str, Any], key: str) -> int:
 def zstd_size(head: bytes) -> int | None:
     """Return the size that a zstd frame says it unpacks to (RFC 8878, 3.1.1), by its first 18 bytes.
 
-    None where it says nothing, and where it is no such frame.
+    None if it says nothing, and where it is no such frame.
     """
     if len(head) < 6 or head[:4] != ZSTD:
         return None
@@ -318,7 +318,7 @@ def toml_text(value: Any) -> str:
 def read_arrays(path: str | Path, names: Sequence[str], what: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of a `.npz` file that holds exactly those in `names`.
 
-    what: the kind of file, for messages. Raises MapFileError where it holds other arrays; a damaged file may raise any
+    what: the kind of file, for messages. Raises MapFileError if it holds other arrays; a damaged file may raise any
     exception in zipfile, zlib and NumPy: catch Exception.
     """
     with zipfile.ZipFile(path) as file:
@@ -347,7 +347,7 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def _plain_file(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """Open a file to read it; yield it and its size. Raises OSError where it is no plain file."""
+    """Open a file to read it; yield it and its size. Raises OSError if it is no plain file."""
     with open(path, "rb", opener=_without_waiting) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
@@ -360,7 +360,7 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def _check_brackets(text: str) -> None:
-    """Raise ValueError where brackets nest deeper than `MAX_DEPTH`; PyYAML's time grows with the square of that."""
+    """Raise ValueError if brackets nest deeper than `MAX_DEPTH`; PyYAML's time grows with the square of that."""
     depth = 0
     for bracket in BRACKETS.findall(text):
         depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)

@@ -57,7 +57,7 @@ class Box(NamedTuple):
 
 
 class DoneBox(NamedTuple):
-    """A box that is mapped: its entry, None where no cell of it is known, and the seconds it took."""
+    """A box that is mapped: its entry, None if no cell of it is known, and the seconds it took."""
 
     entry: BoxEntry | None
     seconds: float
@@ -83,7 +83,7 @@ def boxes_of(recordings: Sequence[tuple[str, NDArray[np.int32], int]], start_ns:
 def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
     """Map one box, write it, and then the entry that says so; a task of a worker.
 
-    Raises MapFileError where a frame is damaged or the place cannot be written.
+    Raises MapFileError if a frame is damaged or the place cannot be written.
     """
     started, (low, high) = perf_counter(), layout.blocks_of(box.at)
     storage, levels = VoxelMap(layout.config).storage, Levels(layout.config)
@@ -161,7 +161,7 @@ def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
 
 
 def _done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:
-    """Return a box that a run before has mapped from the same frames, None where there is none."""
+    """Return a box that a run before has mapped from the same frames, None if missing."""
     data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
     try:
         return None if data is None else loaded(unsealed(data)["done"], layout)

@@ -39,7 +39,7 @@ class Cluster:
     ) -> Iterator[tuple[str, Any]]:
         """Yield name and result of tasks as they end, those of high priority begun first. A failure cancels the others.
 
-        Raises StereovoxError where a task fails, or cannot be done since its workers die or the scheduler is gone.
+        Raises StereovoxError if a task fails, or cannot be done since its workers die or the scheduler is gone.
         """
         from distributed import KilledWorker, as_completed
 
@@ -85,8 +85,8 @@ def cluster(
 ) -> Iterator[Cluster]:
     """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it.
 
-    notify: called with each line that a user should see. Raises StereovoxError where no scheduler answers or a worker
-    has another stereovox, and for less than one worker; MissingExtra where Dask is not installed.
+    notify: called with each line that a user should see. Raises StereovoxError if no scheduler answers or a worker
+    has another stereovox, and for less than one worker; MissingExtra if Dask is not installed.
     """
     if workers is not None and workers < 1:
         raise StereovoxError(f"{workers} workers: give 1 or more, or leave it out for one on each core")
@@ -112,12 +112,12 @@ def cluster(
                 dashboard_address="127.0.0.1:0",
             )  # fmt: skip
         with local as cluster, Client(cluster) as client:
-            cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
+            cluster.adapt(minimum=number, maximum=number, interval="1s")  # also if a nanny is lost with its worker
             yield Cluster(client)
 
 
 def _check_workers(client: Any, scheduler: str, notify: Callable[[str], object]) -> None:
-    """Raise StereovoxError where a worker has not this stereovox: it would end at a task, which it cannot read."""
+    """Raise StereovoxError if a worker has not this stereovox: it would end at a task, which it cannot read."""
     versions = client.run(resolve_name, "stereovox.__version__", on_error="return")
     for worker, theirs in versions.items():
         theirs = "no stereovox" if isinstance(theirs, (ImportError, AttributeError)) else theirs

@@ -139,7 +139,7 @@ def map_fleet(
         **overrides: Settings by name, as for `Mapper`.
 
     Returns:
-        The map, and what each recording gave; one that cannot be read is told there and left out.
+        The map, and what each recording gave; one that cannot be read is reported there and left out.
 
     Raises:
         StereovoxError: One line: not one frame could be used, a setting cannot be had in boxes, or the cluster failed.
@@ -211,7 +211,7 @@ def suggested(recordings: Sequence[Recording], overrides: Mapping[str, Any]) -> 
     """
     for one in recordings:
         with TemporaryDirectory(prefix="stereovox-") as folder, suppress(StereovoxError, OSError):
-            # what is wrong with one is told later; the next may do
+            # what is wrong with one is reported later; the next may do
             return survey(open_source(local(one.where, Path(folder))), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
     return {}, []
 
@@ -261,7 +261,7 @@ def _settings(layout: BoxLayout) -> dict[str, Any]:
 
 
 def _known_layout(place: Place) -> BoxLayout | None:
-    """Return settings and boxes of a run before; None where there was none."""
+    """Return settings and boxes of a run before; None if there was none."""
     known = place.find(SETTINGS, MAX_SETTINGS)
     try:
         values = None if known is None else unsealed(known)
@@ -294,7 +294,7 @@ def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[str, int]]) -> 
 
 
 def _check_still_there(place: Place, reports: Mapping[Recording, RecordingReport]) -> None:
-    """Raise StereovoxError where a recording that the map is made of cannot be read now: it would be taken away."""
+    """Raise StereovoxError if a recording that the map is made of cannot be read now: it would be taken away."""
     if place.find(MANIFEST) is None:
         return
     made_of = read_boxed_manifest(place).extra.get("fleet", {}).get("recordings", [])

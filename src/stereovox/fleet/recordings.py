@@ -51,7 +51,7 @@ SEEN, REPORT = "seen.npy", "report.json"
 COPY, POSES = "recording", "poses"
 """Folders into which a recording of an object store, and the file of its poses, are copied."""
 TEXTS = (".txt", ".md", ".csv", ".json", ".yaml", ".yml", ".toml", ".log")
-"""Endings of files that lie beside recordings and hold text."""
+"""Endings of files that lie next to recordings and hold text."""
 MAX_REPORT = 1 << 24
 """Bytes of a report."""
 
@@ -88,7 +88,7 @@ class RecordingReport:
         frames: Trusted frames.
         refused: Refused frames by reason.
         seconds: Time it took to map it alone; 0 where that was done before.
-        error: Why nothing of it is in the map, one line; "" where it is.
+        error: Why nothing of it is in the map, one line; "" if it is.
         notes: What was assumed about it.
     """
 
@@ -139,7 +139,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
     """Map a recording alone, and put what is kept of it into a place, the report last; a task of a worker.
 
     key: as `Recording.key` was when the run began; on another machine, or of files that change, it may be another one.
-    What cannot be read or mapped is told in the report. Raises MapFileError where the place cannot be written.
+    What cannot be read or mapped is reported in the report. Raises MapFileError if the place cannot be written.
     """
     notes, started = list[str](), perf_counter()
     home = place / f"{RECORDINGS}/{key}"
@@ -166,7 +166,7 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
 def why_not(recording: Recording, error: Exception, folder: Path) -> str:
     """Return in one line why a recording cannot be used, also where what reads it failed in a way nobody foresaw.
 
-    Raises the error itself where it is not the recording's: in `folder`, for its copy and its map, is no room.
+    Raises the error itself if it is not the recording's: in `folder`, for its copy and its map, is no room.
     """
     if isinstance(error, MemoryError):
         return "there is too little memory for it; go on with --resume and fewer --workers"
@@ -192,7 +192,7 @@ def _named(text: str, recording: Recording, folder: Path) -> str:
 
 
 def report_of(place: Place, key: str) -> RecordingReport | None:
-    """Return the report of a recording that was indexed before, None where it was not."""
+    """Return the report of a recording that was indexed before, None if it was not."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
     try:
         return None if saved is None else RecordingReport(**{**unsealed(saved), "seconds": 0.0})
@@ -203,7 +203,7 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
 def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
     """Return which trusted frames of a recording see which boxes: (n, 4) number and index, by number.
 
-    Raises MapFileError where that is damaged.
+    Raises MapFileError if that is damaged.
     """
     data = (place / f"{RECORDINGS}/{key}").read(SEEN)
     if digest_of(data) != manifest_of(place, key).get("seen"):
@@ -212,7 +212,7 @@ def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
 
 
 def manifest_of(place: Place, key: str) -> dict[str, Any]:
-    """Return the manifest of the map that a recording made alone. Raises MapFileError where it is damaged."""
+    """Return the manifest of the map that a recording made alone. Raises MapFileError if it is damaged."""
     data = (place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST)
     try:
         manifest = unsealed(data)
@@ -237,7 +237,7 @@ def frames_of(place: Place, key: str, numbers: Sequence[int]) -> Iterator[Iterat
 
 
 def read_frame(place: Place, key: str, frame: KeptFrame) -> Frame | Cloud:
-    """Return one of these frames. Raises MapFileError where it is damaged."""
+    """Return one of these frames. Raises MapFileError if it is damaged."""
     try:
         return frame.frame()
     except MapFileError as error:
@@ -279,9 +279,9 @@ def _all_kept(voxel_map: VoxelMap) -> Sequence[KeptFrame]:
 def _by_frame(
     layout: BoxLayout, frames: Sequence[KeptFrame], told: Sequence[NDArray[np.int64]]
 ) -> list[NDArray[np.int64]]:
-    """Return the boxes that each frame sees, of what a map's listener was told: nothing where there was no evidence.
+    """Return the boxes that each frame sees, of what a map's listener was reported: nothing if there was no evidence.
 
-    It was told less in cells whose rounding depends on the frame's number, which is another one among recordings.
+    It was reported less in cells whose rounding depends on the frame's number, which is another one among recordings.
     """
     if layout.config.map.cell != "int16":
         return [_around(layout, frame) for frame in frames]
@@ -386,7 +386,7 @@ def _expanded(name: str) -> list[Recording]:
 
 
 def _lies_beside(path: str) -> bool:
-    """Tell whether what a pattern fits is no recording but lies beside some: a map, or text such as calibrations."""
+    """Tell whether what a pattern fits is no recording but lies next to some: a map, or text such as calibrations."""
     begun = os.path.isfile(os.path.join(path, SETTINGS))  # a map that a fleet has not finished
     return is_map(path) or begun or (path.lower().endswith(TEXTS) and os.path.isfile(path) and not is_recording(path))
 

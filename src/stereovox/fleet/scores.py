@@ -39,7 +39,7 @@ COLUMNS: tuple[str, ...] = (
     "recording", "profile", "frames", "refused", "tp", "fp", "tn", "fn", "accuracy", "precision", "recall",
     "specificity", "npv", "error", "correlation", "tolerance_precision", "tolerance_recall", "coverage",
 )  # fmt: skip
-"""Of the table: those of Table 8.1, what they are of, and three that forgive cells beside each other."""
+"""Of the table: those of Table 8.1, what they are of, and three that forgive cells next to each other."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class RecordingScore:
         profile: Of the map.
         frames: Frames in the map.
         refused: Refused frames.
-        scores: All measures, as `Scores.as_dict` names them; empty where there are none.
+        scores: All measures, as `Scores.as_dict` names them; empty if there are none.
         seconds: Time it took.
-        error: Why it has no scores, one line; "" where it has.
+        error: Why it has no scores, one line; "" if it has.
     """
 
     recording: str
@@ -146,7 +146,7 @@ def score_fleet(
         **overrides: Settings by name, for all profiles.
 
     Returns:
-        The scores; a recording without is told there.
+        The scores; a recording without is reported there.
 
     Raises:
         StereovoxError: One line: a setting or `options` is wrong, not one recording could be scored, or the cluster
@@ -231,7 +231,7 @@ def _checked(options: ScoreOptions) -> ScoreOptions:
 
 
 def _check_target(place: Place, resume: bool) -> None:
-    """Raise MapFileError where scores do not belong."""
+    """Raise MapFileError if scores do not belong."""
     if place.find(MANIFEST) is not None:
         raise MapFileError(f"{place}: is a map; choose another name for the scores")
     there = [name for name in place.names("") if not name.startswith(".")]

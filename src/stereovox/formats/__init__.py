@@ -187,7 +187,7 @@ def _cure(ending: str, known: Sequence[str]) -> str:
 
 
 def _check_content(path: Path) -> None:
-    """Raise StereovoxError where git left a pointer in place of a large file."""
+    """Raise StereovoxError if git left a pointer in place of a large file."""
     try:
         if not path.is_file():  # a pipe would block
             return

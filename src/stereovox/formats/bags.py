@@ -96,7 +96,7 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
 
     def octomap_cells(wire: Wire) -> VoxelMap:
         if voxel_size is not None:
-            raise ValueError("an Octomap tells how large its cells are; leave --voxel-size out")
+            raise ValueError("an Octomap reports how large its cells are; leave --voxel-size out")
         return _octomap_cells(wire)
 
     def cloud_cells(wire: Wire) -> VoxelMap:

@@ -37,7 +37,7 @@ class SuggestedCell(NamedTuple):
 
 
 def suggested_cell(xyz: NDArray[np.float64]) -> SuggestedCell | None:
-    """Return the cell size for finite points (N, 3) in metres; None where they tell none: too few, or all in one place.
+    """Return the cell size for finite points (N, 3) in metres; None if they tell none: too few, or all in one place.
 
     Twice the typical distance of neighbouring points, so that a surface has no holes; larger where the longest side
     would have more than `MOST_ALONG` cells.
@@ -56,7 +56,7 @@ def suggested_cell(xyz: NDArray[np.float64]) -> SuggestedCell | None:
 
 
 def suggested_for_mesh(vertices: NDArray[np.float64]) -> SuggestedCell | None:
-    """Return the cell size for a mesh with vertices (N, 3) in metres; None where all are in one place."""
+    """Return the cell size for a mesh with vertices (N, 3) in metres; None if all are in one place."""
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     if not extent > 0:
         return None

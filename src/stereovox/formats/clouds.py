@@ -48,10 +48,10 @@ LAS = (".las", ".laz")
 class PointFile(NamedTuple):
     """Points as they stand in a file.
 
-    xyz: (N, 3) float64, in the file's unit and frame; not finite where there is none. holds: what the file is, in a few
+    xyz: (N, 3) float64, in the file's unit and frame; not finite if there is none. holds: what the file is, in a few
     words. voxel_size: metres, where the file has the centres of cells and says so. faces: (M, 3) whole numbers, which
     points are the corners of each triangle; None for bare points. metres: metres per unit along each axis, and how the
-    file says so; None where it says nothing. notes: what the user should know.
+    file says so; None if it says nothing. notes: what the user should know.
     """
 
     xyz: NDArray[np.float64]
@@ -85,7 +85,7 @@ def read_cloud_map(
 def read_cloud(path: str | Path) -> PointFile:
     """Return the points of a file with one of the endings `formats.CLOUDS`.
 
-    Raises MapFileError, MissingExtra where the library for `.las` is not installed.
+    Raises MapFileError, MissingExtra if the library for `.las` is not installed.
     """
     ending = Path(path).suffix.lower()
     if ending in LAS:
@@ -150,7 +150,7 @@ def _in_metres(cloud: PointFile, unit: str | None) -> tuple[NDArray[np.float64],
 def _near_origin(
     xyz: NDArray[np.float64], origin: Sequence[float] | None
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return the points about the map's origin, and a note where that is not the file's."""
+    """Return the points about the map's origin, and a note if that is not the file's."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if np.abs(finite).max() > EARTH:
         raise StereovoxError(

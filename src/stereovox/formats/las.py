@@ -102,7 +102,7 @@ def _check_header(content: bytes) -> None:
 
 
 def _check_chunks(content: bytes, offset: int) -> None:
-    """Raise ValueError where the table of packed chunks lies outside the file or names too many of them."""
+    """Raise ValueError if the table of packed chunks lies outside the file or names too many of them."""
     (table,) = struct.unpack_from("<q", content, offset)
     (table,) = struct.unpack_from("<q", content, len(content) - 8) if table == -1 else (table,)
     if not offset + 8 <= table <= len(content) - 8:
@@ -121,7 +121,7 @@ def _check_count(header: Any, size: int) -> None:
 
 
 def _check_layers(content: bytes, header: Any) -> None:
-    """Raise ValueError where a packed chunk says that one of its layers is longer than the chunk.
+    """Raise ValueError if a packed chunk says that one of its layers is longer than the chunk.
 
     Points of format 6 and more are packed in layers: a chunk is a point, a count, the bytes of each layer, and these.
     """
@@ -147,7 +147,7 @@ def _pieces(reader: Any) -> Iterator[NDArray[np.float64]]:
 
 
 def _metres(header: Any) -> tuple[tuple[float, float, float], str] | None:
-    """Return metres per unit along x, y and z, and the unit's name; None where the file names none.
+    """Return metres per unit along x, y and z, and the unit's name; None if the file names none.
 
     Raises _Degrees where x and y are degrees.
     """

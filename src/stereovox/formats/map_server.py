@@ -40,7 +40,7 @@ SCALE_STEPS = 254
 
 
 def read_map_server(path: str | Path) -> OccupancyGrid:
-    """Return the map whose .yaml is `path`, or stands beside `path` where that is its picture.
+    """Return the map whose .yaml is `path`, or stands next to `path` if that is its picture.
 
     With p = (255 - brightness) / 255, or brightness / 255 where `negate` is set, cells are, by mode:
     trinary: 100 where p > occupied_thresh, 0 where p < free_thresh, else -1; opacity counts as one more colour.
@@ -58,7 +58,7 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
 
 
 def metadata_of(path: str | Path) -> Metadata:
-    """Return the contents of the .yaml `path`, or of that beside `path` where that is a picture.
+    """Return the contents of the .yaml `path`, or of that next to `path` if that is a picture.
 
     Raises MapFileError for anything invalid.
     """
@@ -415,5 +415,5 @@ def _yaml_of(path: Path) -> Path:
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
     if not there:
-        raise MapFileError(f"{path}: no {path.stem}.yaml beside it, which tells what its greys mean")
+        raise MapFileError(f"{path}: no {path.stem}.yaml next to it, which tells what its greys mean")
     return there[0]

@@ -43,7 +43,7 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
 def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells as PCL's binary point cloud, with the same fields as `write_ply`.
 
-    Raises MapFileError where the file cannot be written.
+    Raises MapFileError if the file cannot be written.
     """
     points, colours = _occupied(voxel_map, PCD_POINT)
     points["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
@@ -56,7 +56,7 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
 
     Arrays: `indices` (N, 3) int32, cell i covers [i, i + 1) * voxel_size; `log_odds` (N,) float32; and the numbers
     `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). Cells not listed are unknown. `settings`
-    (M,) uint8 is JSON. Raises MapFileError where the file cannot be written.
+    (M,) uint8 is JSON. Raises MapFileError if the file cannot be written.
     """
     indices, log_odds = voxel_map.cells()
     limits = voxel_map.config.map

@@ -69,7 +69,7 @@ def _config(voxel_size: float) -> Config:
 
 
 def check_room(indices: NDArray[np.integer]) -> None:
-    """Raise StereovoxError where cells (N, 3) lie in more than `MAX_BLOCKS` blocks."""
+    """Raise StereovoxError if cells (N, 3) lie in more than `MAX_BLOCKS` blocks."""
     blocks = len(blocks_of_cells(indices)[0]) if len(indices) > MAX_BLOCKS else len(indices)
     if blocks > MAX_BLOCKS:
         raise StereovoxError(f"its cells lie in {blocks} blocks, more than {MAX_BLOCKS}; use larger cells or crop it")

@@ -118,7 +118,7 @@ def _binary_scans(content: bytes) -> Iterator[Scan]:
     at = 4
     for _ in range(number):
         (count,) = struct.unpack_from("<I", content, at)
-        records = np.frombuffer(content, POINT, count, at + 4)  # ValueError where they are not there
+        records = np.frombuffer(content, POINT, count, at + 4)  # ValueError if they are not there
         at += 4 + records.nbytes
         three, x, y, z, four, qw, qx, qy, qz = POSE.unpack_from(content, at)
         at += POSE.size + 4

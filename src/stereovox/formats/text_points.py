@@ -50,7 +50,7 @@ def read_text_points(path: str | Path) -> NDArray[np.float64]:
 def _layout(text: str) -> tuple[int, str | None, tuple[int, ...]]:
     """Return where the numbers begin, what separates them, and which columns are x, y and z.
 
-    Raises ValueError where no line holds three numbers.
+    Raises ValueError if no line holds three numbers.
     """
     start, named = 0, None
     for line in text[:HEAD].splitlines(keepends=True):
@@ -83,7 +83,7 @@ def _is_count(words: list[str]) -> bool:
 
 
 def _named(words: list[str]) -> tuple[int, ...] | None:
-    """Return the columns of x, y and z in a line of names (`//X`, `x [m]`), None where it does not name them."""
+    """Return the columns of x, y and z in a line of names (`//X`, `x [m]`), None if it does not name them."""
     names = [found[0] if (found := NAME.search(word.lower())) else "" for word in words]
     names = [name for name in names if name] if words and not NAME.search(words[0].lower()) else names
     return (names.index("x"), names.index("y"), names.index("z")) if {"x", "y", "z"} <= set(names) else None

@@ -34,7 +34,7 @@ class UpdateReport:
         depth_ms: Milliseconds to prepare the depth image or scan.
         integrate_ms: Milliseconds to turn it into evidence and put that into the map.
         cells: Number of cells whose value changed.
-        refused: Reason the frame was refused; None where it was taken.
+        refused: Reason the frame was refused; None if it was taken.
         detail: The refusal in one line, or a note that frames of this sensor are accepted again.
         match_ms: Milliseconds to rectify and match a stereo pair; 0 for other frames.
         quality: Quality level of the frame: `full`, or `near` or `coarse` where `deadline_ms` left less time.
@@ -115,7 +115,7 @@ class Photo:
 
     Attributes:
         pixels: (height, width) uint8 grey or (height, width, 3) uint8 RGB; or a function that reads them once they are
-            needed, and raises FrameRefused where it cannot.
+            needed, and raises FrameRefused if it cannot.
         camera: The camera that took it, without distortion; its size must be the image's.
         T_sensor_camera: (4, 4) float64, maps its optical frame into that of the depth camera; the same where depth is
             registered to the image.

@@ -74,7 +74,7 @@ class StampClock:
                 self._least = min(max(offsets), self._least_at(now_ns)), now_ns
 
     def age_ns(self, stamp_ns: int, now_ns: int) -> int:
-        """Return the least age at `now_ns` of what has a stamp; negative where nothing is known of its clock."""
+        """Return the least age at `now_ns` of what has a stamp; negative if nothing is known of its clock."""
         with self._lock:
             ages = [self.clock_age_ns(stamp_ns, now_ns)]
             if self._newest is not None and self._ordered:

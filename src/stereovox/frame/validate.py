@@ -125,7 +125,7 @@ def validate_scan(scan: Scan, rigidity: float) -> Scan:
 def validate_upright_scan(scan: Scan, config: Config) -> Scan:
     """Return the scan with an exactly rigid pose.
 
-    Raises FrameRefused as `validate_scan`, or `tilted` where the sensor leans by more than `grid.max_tilt_deg`.
+    Raises FrameRefused as `validate_scan`, or `tilted` if the sensor leans by more than `grid.max_tilt_deg`.
     """
     scan = validate_scan(scan, config.pose_rigidity_tolerance)
     upright = abs(scan.T_world_sensor[2, 2])  # a sensor may hang upside down
@@ -154,7 +154,7 @@ def rigid_pose(frame: Frame | Cloud | Scan, tolerance: float) -> se3.Transform:
 
 
 def _check_place(T: NDArray[np.float64], name: str) -> None:
-    """Raise FrameRefused where a pose (4, 4) holds numbers that are not finite, or stands too far from the origin."""
+    """Raise FrameRefused if a pose (4, 4) holds numbers that are not finite, or stands too far from the origin."""
     if not all(map(isfinite, T.ravel().tolist())):
         raise FrameRefused("pose_not_finite", f"{name}: the pose holds NaN or infinity; leave the frame out")
     farthest = max(map(abs, T[:3, 3].tolist()))

@@ -175,7 +175,7 @@ def _solvable() -> Iterator[None]:
 
 
 def need_gtsam() -> None:
-    """Raise MissingExtra where gtsam is not installed: before the work, not in the middle of it."""
+    """Raise MissingExtra if gtsam is not installed: before the work, not in the middle of it."""
     if find_spec("gtsam") is None:
         raise MissingExtra("gtsam", "slam")
 

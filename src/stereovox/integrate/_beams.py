@@ -35,7 +35,7 @@ def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, f
 
     directions: (N, 2) cosines and sines in the sensor's frame. turn: (2, 2) from there to cells. position: (2,) of the
     sensor in cells. limits: (3,) float32 nearest range that counts, farthest that does, farthest the sensor measures.
-    clear: (N,), or empty where ranges alone tell; clear_from: (N,), or empty where it is from the sensor on.
+    clear: (N,), or empty where ranges alone tell; clear_from: (N,), or empty if it is from the sensor on.
     taken_back: points in cells that are hit and that the line before clears. box: (4,) lowest column and row, highest
     column and row of all.
     """

@@ -30,7 +30,7 @@ LANES = 32
 GROUP_BITS = 3
 """Binary logarithm of the lanes whose gains are summed one after the other."""
 MEMORY_BITS = 9
-"""Binary logarithm of the blocks whose places are cached beside the pool's hash: 8 along each axis."""
+"""Binary logarithm of the blocks whose places are cached next to the pool's hash: 8 along each axis."""
 NOWHERE = np.float32(-1e30)
 """In place of the depth of a cell that a lane says nothing about."""
 FRACTION_BITS = 10
@@ -188,7 +188,7 @@ def aim_at_hits(lanes, table, weight):
 
 @cell
 def bit_if(differs, bit):
-    """Return `bit` where something differs, 0 elsewhere; no branch, which some processors have no vectors for."""
+    """Return `bit` if something differs, 0 elsewhere; no branch, which some processors have no vectors for."""
     return np.int32(bit & np.int32(-np.int32(differs)))
 
 

@@ -41,7 +41,7 @@ def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, m
     farthest = build(ends.reshape(ends.size), windows, scratch)
     if table.marks:
         nearest_tiles(depth_m, nearest[0], nearest[1])
-        farthest = view.max_range  # a lone pixel, which clears nothing, marks cells beside its point
+        farthest = view.max_range  # a lone pixel, which clears nothing, marks cells next to its point
     return _candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
 
 
@@ -439,13 +439,13 @@ def table_place(table, row, behind, scale):
 
 @cell
 def cleared(said, lowest, measured):
-    """Return what a cell gets of which the table says so, never below `lowest`: nothing where nothing was measured."""
+    """Return what a cell gets of which the table says so, never below `lowest`: nothing if nothing was measured."""
     return np.int16(max(said, lowest) if measured > ZERO else np.int32(0))
 
 
 @cell
 def marked(depth_m, view, table, cx, cy, cz, c):
-    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 where there is none."""
+    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 if there is none."""
     rows = table.hit.size
     last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
     z = cz + view.steps[2, c]

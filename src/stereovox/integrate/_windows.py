@@ -2,7 +2,7 @@
 """Kernels that build window images: how far one sees through the pixels about a place, for windows of all sizes.
 
 Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
-around it. A tile is seen through as far as its nearest pixel (`_shrink`): beside an edge or a hole, where depths are
+around it. A tile is seen through as far as its nearest pixel (`_shrink`): next to an edge or a hole, where depths are
 often wrong and thin things are missed, cells from some four pixels on are cleared only by patches that see through as a
 whole, smaller ones by single pixels. For fast culling each level also has the nearest and farthest value of tiles of 16
 and 64 of its own pixels. No value is 0, so it is the nearest of all and never clears anything.

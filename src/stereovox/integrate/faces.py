@@ -54,7 +54,7 @@ def faces_of(camera: WideCamera, config: Config) -> list[Face]:
     """Return the faces that a wide camera sees. They do not overlap, and miss no row or column, except
     rows that crowd near the x axis.
 
-    Raises FrameRefused `bad_camera` where the view or the faces were out of proportion to the image.
+    Raises FrameRefused `bad_camera` if the view or the faces were out of proportion to the image.
     """
     check_view(camera, config)
     try:
@@ -105,7 +105,7 @@ def _pinhole(camera: WideCamera, forward: tuple[int, int, int]) -> PinholeCamera
 def _around(camera: WideCamera, middle: float) -> Window | None:
     """Return where a face that looks in the direction of rows, `middle` radians down from the z axis, sees the image.
 
-    A ray `a` beside the y-z plane has the slopes x = tan(a) |1, y| and y.
+    A ray `a` next to the y-z plane has the slopes x = tan(a) |1, y| and y.
     """
     left, right, top, bottom = camera.borders
     first = middle + 2 * pi * floor((top - middle) / (2 * pi))
@@ -123,7 +123,7 @@ def _around(camera: WideCamera, middle: float) -> Window | None:
 def _beside(camera: WideCamera, side: int) -> Window | None:
     """Return where the face that looks along the x axis (side 1) or back along it (-1) sees the image.
 
-    A ray `a` beside the y-z plane stands 1 / tan(a) from its middle, in the direction of its row.
+    A ray `a` next to the y-z plane stands 1 / tan(a) from its middle, in the direction of its row.
     """
     left, right, top, bottom = camera.borders
     near, far = (left, right) if side > 0 else (-right, -left)

@@ -41,7 +41,7 @@ class GpuProjective:
     def evidence(self, image: DepthImage) -> GpuEvidence:
         """Return the evidence of `image` on the cells it sees; its memory is reused by the next call.
 
-        Raises ConfigError for a wide camera, FrameRefused `memory_full` where the card has no room for it.
+        Raises ConfigError for a wide camera, FrameRefused `memory_full` if the card has no room for it.
         """
         if not isinstance(image.camera, PinholeCamera):
             raise ConfigError('device "cuda" maps pinhole cameras only, and this one is wider; use device "cpu"')
@@ -119,7 +119,7 @@ class GpuEye:
         return most <= room and hit_blocks <= hit_room
 
     def _make_room(self, blocks: int) -> None:
-        """Make lists for so many blocks of each kind: all of them, or none where there is no room."""
+        """Make lists for so many blocks of each kind: all of them, or none if there is no room."""
         lists = [gpu_array((blocks, 3), np.int32) for _ in range(4)]
         hit_of = gpu_array(blocks, np.int32)
         made = GpuArrays(
@@ -194,7 +194,7 @@ class GpuHits:
         self.make_room(HIT_ROOM)
 
     def make_room(self, blocks: int) -> None:
-        """Make room for so many blocks with hits: in all arrays, or in none where there is no room."""
+        """Make room for so many blocks with hits: in all arrays, or in none if there is no room."""
         self.coords, self.values, self.table, self.taken = (
             gpu_array((blocks, 3), np.int32),
             gpu_array((blocks, CELLS), np.int16),

@@ -56,7 +56,7 @@ class Points:
     def evidence(self, cloud: CheckedCloud) -> Evidence:
         """Return the evidence of a checked cloud; its memory is reused by the next call.
 
-        Raises FrameRefused `view_too_large` where it is on more cells than can be counted.
+        Raises FrameRefused `view_too_large` if it is on more cells than can be counted.
         """
         config, tools = self._config, self._tools[cloud.lidar]
         rays, runs, places = self._laid_out(cloud, tools.table)
@@ -116,7 +116,7 @@ class Points:
         return places, of_place.reshape(-1)
 
     def _is_wide(self, table: KernelTable, places: NDArray[np.float32]) -> bool:
-        """Return whether cells need keys of 64 bits. Raises FrameRefused where these do not suffice either."""
+        """Return whether cells need keys of 64 bits. Raises FrameRefused if these do not suffice either."""
         config = self._config
         beyond = float(table.reach[-1]) if table.marks else 0.0
         far = (config.max_range + beyond) / min(config.cell) + SIDE + float(np.abs(places).max(initial=0))

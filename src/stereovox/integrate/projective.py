@@ -210,7 +210,7 @@ class HitScratch(NamedTuple):
     """Memory of `_hits.scatter`."""
 
     keys: NDArray[np.signedinteger]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
-    news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those beside it
+    news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those next to it
     fresh: NDArray[np.int32]  # one longer: the pixels with such cells
     seen: NDArray[np.signedinteger]  # (SEEN,) keys of recently entered cells
 
@@ -262,7 +262,7 @@ class WindowScratch(NamedTuple):
 
 
 Tiles = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Nearest depth in tiles of 16 and of 64 pixels, for sensor models that mark cells beside the hit."""
+"""Nearest depth in tiles of 16 and of 64 pixels, for sensor models that mark cells next to the hit."""
 
 
 def make_windows(camera: PinholeCamera, smallest_tile: float) -> tuple[Windows, WindowScratch, Tiles]:

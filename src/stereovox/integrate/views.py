@@ -82,7 +82,7 @@ class KernelTable(NamedTuple):
     """A sensor table in whole thousandths of log-odds, split by sign."""
 
     clear: NDArray[np.int32]  # (rows, columns) negative evidence, 0 elsewhere; column 0 exactly the free value
-    mark: NDArray[np.int32]  # (rows, columns) positive evidence beside the hit, 0 elsewhere
+    mark: NDArray[np.int32]  # (rows, columns) positive evidence next to the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
     passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is looked through; negative
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
@@ -93,7 +93,7 @@ class KernelTable(NamedTuple):
     rows_per_metre: np.float32
     blind: np.float32  # depth in metres up to which nothing is cleared
     free: np.int32  # evidence far before a measurement, where `passed` allows it
-    marks: bool  # whether there is any positive evidence beside the hit
+    marks: bool  # whether there is any positive evidence next to the hit
 
 
 class Rays(NamedTuple):
@@ -181,7 +181,7 @@ def origin_block(T_world_camera: Transform, config: Config) -> NDArray[np.int64]
 
 
 def check_place(T_world_sensor: Transform, config: Config) -> None:
-    """Raise FrameRefused `pose_too_far` where a sensor that stands there sees cells that no map can have."""
+    """Raise FrameRefused `pose_too_far` if a sensor that stands there sees cells that no map can have."""
     limit = INDEX_LIMIT - (2 << _cells.WIDE)
     if not (np.abs(T_world_sensor[:3, 3]) < limit * np.array(config.cell)).all():
         detail = f"the pose is more than {limit} cells from the map's origin; subtract an offset, or use larger cells"
@@ -247,7 +247,7 @@ class Views:
 
 
 def check_view(camera: VirtualCamera, config: Config) -> None:
-    """Raise FrameRefused `bad_camera` where the view up to the maximum range is out of proportion to the image."""
+    """Raise FrameRefused `bad_camera` if the view up to the maximum range is out of proportion to the image."""
     blocks = camera.volume(config.max_range) / (CELLS * float(np.prod(config.cell)))
     if blocks > _fitting_blocks(camera):
         seen = f"{camera.width}x{camera.height} pixels see {CELLS * blocks:.2g} cells up to {config.max_range:g} m"

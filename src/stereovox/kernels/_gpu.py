@@ -86,7 +86,7 @@ def gpu_array(shape: int | tuple[int, ...], dtype: Any, value: int | float | Non
 
 
 def unusable() -> str | None:
-    """Return why nothing can run on a card here; None where it can, and in numba's simulator."""
+    """Return why nothing can run on a card here; None if it can, and in numba's simulator."""
     if ENABLE_CUDASIM:
         return None
     if find_spec("numba_cuda") is None:

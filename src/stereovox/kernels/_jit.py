@@ -90,7 +90,7 @@ def exact_cell(function: Function) -> Function:
 
 @lru_cache
 def cache_folder() -> Path | None:
-    """Return the folder of compiled kernels, None where none can be written."""
+    """Return the folder of compiled kernels, None if none can be written."""
     name = f"stereovox-kernels-{_source_hash()}"
     for base in (os.environ.get("STEREOVOX_CACHE"), _user_cache(), tempfile.gettempdir()):
         folder = Path(base) / "stereovox" / name if base else None

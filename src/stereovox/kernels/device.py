@@ -25,20 +25,20 @@ def on_usable_device(config: Config, notify: Callable[[str], None] = warn) -> Co
 
 
 def check_device() -> None:
-    """Raise ConfigError where no graphics card can be used; for what is made without a mapper."""
+    """Raise ConfigError if no graphics card can be used; for what is made without a mapper."""
     reason = _no_card()
     if reason is not None:
         raise ConfigError(f'device "cuda": {reason}')
 
 
 def check_on_processor(config: Config) -> None:
-    """Raise ConfigError where the settings are those of a graphics card, on which there are no maps of floors."""
+    """Raise ConfigError if the settings are those of a graphics card, on which there are no maps of floors."""
     if config.device != "cpu":
         raise ConfigError(f'device "{config.device}": maps of floors are made on the processor only; leave it out')
 
 
 def _no_card() -> str | None:
-    """Return why no graphics card can be used; None where one can."""
+    """Return why no graphics card can be used; None if one can."""
     try:
         from stereovox.kernels._gpu import unusable
     except ImportError as error:

@@ -177,7 +177,7 @@ class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stu
     """A re-entrant lock that can be copied and pickled; the copy is a new lock, not held by any thread."""
 
     def refuse_holder(self, what: str = "a frame cannot be added") -> None:
-        """Raise StereovoxError where this thread holds the lock: waiting for another lock now could deadlock.
+        """Raise StereovoxError if this thread holds the lock: waiting for another lock now could deadlock.
 
         what: begins the error.
         """

@@ -109,7 +109,7 @@ class GridFile:
         self._worker.shutdown()
 
     def _current(self) -> bool:
-        """Return whether the map is fresh enough to be written, and tell the user once where it is not."""
+        """Return whether the map is fresh enough to be written, and tell the user once if it is not."""
         why = context_of(self._mapper).stale
         was, self._stale = self._stale, bool(why)
         if why and not was:

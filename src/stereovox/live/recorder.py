@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record depth images and poses beside mapping them, so that the same can be mapped again."""
+"""Record depth images and poses next to mapping them, so that the same can be mapped again."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ ENDINGS = (".mcap", ".bag", ".db3")
 class Recorder:
     """Writes images, poses of the body and mounts to a bag, in a thread of its own; an output of a live run.
 
-    Topics: `/NAME/depth/image_rect_raw` and `camera_info` beside it, `/tf` (odom to base_link at the time of each image
+    Topics: `/NAME/depth/image_rect_raw` and `camera_info` next to it, `/tf` (odom to base_link at the time of each
+    image
     that has a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` where pictures are taken
     along, and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or float metres where the source has
     these. Images that the map refused are recorded, too.
@@ -115,7 +116,7 @@ class Recorder:
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
                 self.failure = f"{self.file}: no image came that could be recorded; nothing is recorded"
-        except Exception as error:  # whatever it is, the user is told, and nobody waits for this thread
+        except Exception as error:  # whatever it is, the user is reported, and nobody waits for this thread
             why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
             self.failure = f"{why}; {self._left()}"
             self._notify(f"{self.failure}, mapping goes on")

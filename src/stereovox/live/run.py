@@ -49,7 +49,7 @@ class LiveResult:
         stopped: Whether a signal ended it (Ctrl-C, SIGTERM or SIGHUP), as is usual.
         live: Latency, images and poses by where they came from, and outputs: the part `live` of `summary`.
         poses: `given`, `track`, or the name of the stream of poses.
-        failures: What was to be written beside the map and is not, a line each.
+        failures: What was to be written next to the map and is not, a line each.
     """
 
     map: VoxelMap
@@ -64,7 +64,7 @@ class LiveResult:
         """Summarise the run.
 
         Returns:
-            The numbers of `stereovox live --json`: those of `map`, and `live`; `not_written` where something was to be
+            The numbers of `stereovox live --json`: those of `map`, and `live`; `not_written` if something was to be
             and is not.
         """
         found = {**summarise(self.map, self.reports), "poses": self.poses, "live": self.live}

@@ -44,7 +44,7 @@ ones; images that wait, for each camera, and for tracking."""
 TICK_S, SOON_S = 0.1, 0.01
 """Seconds after which a stream without news says so, and after which waiting images are looked at again."""
 REMIND_S = 5.0
-"""Seconds without any pose, with bad lines, or without an image of a camera, until the user is told."""
+"""Seconds without any pose, with bad lines, or without an image of a camera, until the user is reported."""
 HOST_CLOCK_NS = 60_000_000_000
 """Stamps that are not older than this by the clock of this machine are believed to be by it."""
 REMEMBERED = 300
@@ -66,8 +66,8 @@ class Moment(NamedTuple):
 class _Feed:
     """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more.
 
-    heard_ns: when its last image came, or it was started; monotonic. told: what the user was told last that is wrong.
-    clock: what watches its clock, where poses do not come with images.
+    heard_ns: when its last image came, or it was started; monotonic. told: what the user was reported last that is
+    wrong. clock: what watches its clock, where poses do not come with images.
     """
 
     camera: LiveCamera
@@ -321,7 +321,7 @@ class LiveStream(Stream):
                 close()
         except StereovoxError as error:
             feed.failure = str(error)
-        except Exception as error:  # a camera that breaks must be told, not vanish with its thread
+        except Exception as error:  # a camera that breaks must be reported, not vanish with its thread
             feed.failure = f"{feed.name}: {type(error).__name__}: {error}"
         finally:
             feed.ended = True
@@ -390,7 +390,7 @@ class LiveStream(Stream):
             self._notify(trouble)
 
     def _trouble(self, feed: _Feed) -> str:
-        """Return why a camera delivers nothing; "" where it does, has ended, or was the last one: that is raised."""
+        """Return why a camera delivers nothing; "" if it does, has ended, or was the last one: that is raised."""
         if feed.ended:
             return "" if all(one.failure for one in self._feeds) else feed.failure
         silent = monotonic_ns() - feed.heard_ns > 1e9 * REMIND_S

@@ -26,7 +26,7 @@ SCANS, BEAMS, RIGID = 60, 60, 5e-3
 def fit_share(grid: OccupancyGrid, scans: Sequence[Scan], track: Track) -> float | None:
     """Return the share of beams (0 to 1) that end near an obstacle of the map, over scans spread along the way.
 
-    Beams that met nothing do not count. None where no beam met anything.
+    Beams that met nothing do not count. None if no beam met anything.
     """
     field = distance_field(_with_rim(grid), 2 * NEAR)
     found = [_distances(field, scans[i], track) for i in _spread(len(scans))]

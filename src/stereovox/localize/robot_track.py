@@ -32,7 +32,7 @@ def no_progress(done: int, total: int, text: str) -> None:
 def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -> SlamResult:
     """Run SLAM over a robot's scans.
 
-    Raises MissingExtra without gtsam, StereovoxError where there are no scans, and as `map_scans`.
+    Raises MissingExtra without gtsam, StereovoxError if there are no scans, and as `map_scans`.
     """
     need_gtsam()  # not after an hour, when the first loop is found
     if not len(robot.scans):
@@ -54,7 +54,7 @@ def localise_robot(
 ) -> Track:
     """Return the robot's track through a map; `start`: x, y, yaw in metres and radians, None: anywhere.
 
-    Raises StereovoxError where there are no scans, and as `localise`.
+    Raises StereovoxError if there are no scans, and as `localise`.
     """
     total = len(robot.scans)
     if not total:
@@ -111,7 +111,7 @@ def fit_of(robot: Robot, floor: OccupancyGrid, track: Track) -> tuple[float | No
     """Return the share of beams that fit the map along the track, and a line that states it, with a warning if it is
     low.
 
-    None and "" where no beam met anything.
+    None and "" if no beam met anything.
     """
     fit = fit_share(floor, robot.scans, track)
     if fit is None:

@@ -19,8 +19,8 @@ class Beams:
     origin: (2,) float64 x, y of the sensor in the robot's frame.
     directions: (K, 2) float64, the way a beam goes for each metre of its length, seen from above in the robot's frame.
         Shorter than one where the sensor is tilted.
-    ranges: (K,) float64 metres; `range_max` where nothing was met.
-    at_max: (K,) bool, tells which met nothing.
+    ranges: (K,) float64 metres; `range_max` if nothing was met.
+    at_max: (K,) bool, reports which met nothing.
     range_max: metres.
     """
 

@@ -24,7 +24,7 @@ class Track:
 
     stamps_ns: (N,) int64 nanoseconds, ascending. pose_map_base: (N, 3) float64, the robot in the map. pose_map_odom:
     (N, 3) float64, from the odometry's poses to those (the `map -> odom` of ROS). refused: scans left out, by reason;
-    first_refusal: message of the first one. Raises StereovoxError where stamps do not ascend: times between them would
+    first_refusal: message of the first one. Raises StereovoxError if stamps do not ascend: times between them would
     be looked up wrongly.
     """
 
@@ -61,7 +61,7 @@ class Track:
     def save(self, path: str | Path) -> None:
         """Write where the robot stood as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
 
-        Raises MapFileError where the file cannot be written; an older one is then still there.
+        Raises MapFileError if the file cannot be written; an older one is then still there.
         """
         poses = np.array([se2.lifted(pose) for pose in self.pose_map_base]).reshape(-1, 4, 4)
         write_trajectory(path, self.stamps_ns.tolist(), poses, "robot in the map, on the floor")

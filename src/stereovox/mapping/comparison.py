@@ -136,7 +136,7 @@ class Placed(NamedTuple):
 
     agrees: on a surface. against: in what is known to be free, or behind an occupied cell and on no surface. behind:
     on a surface, seen through an occupied cell before it. lengths: how often the ray to a point fits between the
-    sensor and the map's first surface along it, inf where there is none.
+    sensor and the map's first surface along it, inf if there is none.
     """
 
     agrees: NDArray[np.bool_]
@@ -180,7 +180,7 @@ def _fault(
     placed: Placed,
     align: bool,
 ) -> str:
-    """Return the fault under which points (N, 3) would lie on the map's surfaces, "" where there is none.
+    """Return the fault under which points (N, 3) would lie on the map's surfaces, "" if there is none.
 
     Tried are those of `FAULTS`, depths too large or too small by a factor or by some metres, and a sensor that stands
     elsewhere; the last only if `align`, for it takes longest.
@@ -214,7 +214,7 @@ def _fault(
 def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     """Return a T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
 
-    None where there is no such pose, or the image already lies there within a cell.
+    None if there is no such pose, or the image already lies there within a cell.
 
     Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the search
     radius shrinks from iteration to iteration.

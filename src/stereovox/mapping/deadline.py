@@ -40,7 +40,7 @@ FACE = sqrt(2)
 class Deadline:
     """Chooses the quality level of each frame from the time that the frames before took.
 
-    Without `deadline_ms` every frame is `full`. Raises ConfigError where the `pace` settings leave nothing to see.
+    Without `deadline_ms` every frame is `full`. Raises ConfigError if the `pace` settings leave nothing to see.
     """
 
     def __init__(self, config: Config):
@@ -49,7 +49,7 @@ class Deadline:
         self._warm: set[VirtualCamera | Lidar] = set()
 
     def quality(self) -> Quality:
-        """Return the quality level of the next frame. Raises FrameRefused `no_time` where it must be skipped."""
+        """Return the quality level of the next frame. Raises FrameRefused `no_time` if it must be skipped."""
         if self._scheduler is None:
             return self._levels[0]
         if self._scheduler.skips():
@@ -130,7 +130,7 @@ def full_quality(config: Config) -> Quality:
 
 
 def quality_levels(config: Config) -> list[Quality]:
-    """Return the levels `full`, `near` and `coarse`. Raises ConfigError where `near` would see nothing."""
+    """Return the levels `full`, `near` and `coarse`. Raises ConfigError if `near` would see nothing."""
     near = config.pace.near_share * config.max_range
     cleared = near - float(np.linalg.norm(config.cell)) / 2  # a cell may be cleared only if all of it can be seen
     if cleared <= config.min_range:
@@ -155,7 +155,7 @@ class Levels:
         self._made: dict[str, Quality] = {}
 
     def __call__(self, name: str) -> Quality:
-        """Return the level of this name. Raises ConfigError where its settings leave nothing to see."""
+        """Return the level of this name. Raises ConfigError if its settings leave nothing to see."""
         if name not in self._made:
             levels = [full_quality(self._config)] if name == FULL else quality_levels(self._config)
             self._made = {level.name: level for level in levels} | self._made

@@ -57,8 +57,8 @@ CURES = {
 class Sight(NamedTuple):
     """How a frame in doubt lies in the map, point by point.
 
-    anchored: share of its points on what is known that agree with the map; None where less than MOSTLY_KNOWN of all
-    are. fault: the fault under which it would agree, "" where there is none. against: how many points contradict the
+    anchored: share of its points on what is known that agree with the map; None if less than MOSTLY_KNOWN of all
+    are. fault: the fault under which it would agree, "" if there is none. against: how many points contradict the
     map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
     the glance before says of both. glance: what it sees itself.
     """
@@ -87,7 +87,7 @@ class Sight(NamedTuple):
 
     @property
     def outcome(self) -> str:
-        """The name of the fault, or a key of CURES: what is wrong with it; "" where it shows a changed world."""
+        """The name of the fault, or a key of CURES: what is wrong with it; "" if it shows a changed world."""
         if self.fault:
             return self.fault
         if self.anchored is None or self.anchored < ANCHORED:
@@ -109,8 +109,8 @@ class Sight(NamedTuple):
 class Agreement(NamedTuple):
     """How an accepted frame agrees with the map.
 
-    against: its disagreement, None where too little is known. doubt: the doubt that remains. after: the reason of the
-    refusals that this acceptance ends, "" where there were none.
+    against: its disagreement, None if too little is known. doubt: the doubt that remains. after: the reason of the
+    refusals that this acceptance ends, "" if there were none.
     """
 
     against: float | None
@@ -153,7 +153,7 @@ class DisagreementMonitor:
     ) -> Agreement:
         """Return what `accept` needs once the map has changed.
 
-        against: share of the frame's evidence that contradicts the map, None where too little is known. sight: how it
+        against: share of the frame's evidence that contradicts the map, None if too little is known. sight: how it
         lies in the map, where it is `in_doubt`. Raises FrameRefused: `disagrees_with_map`, `camera_moved`,
         `contradicts_map`.
         """
@@ -182,7 +182,7 @@ class DisagreementMonitor:
             self._history.usual[sensor] = usual.updated(agreement.against, USUAL_GAIN)
 
     def _last_ns(self, sensor: str, now_ns: int) -> int:
-        """Return the stamp of the frame before, accepted or in doubt; `now_ns` where there is none."""
+        """Return the stamp of the frame before, accepted or in doubt; `now_ns` if there is none."""
         stamps_ns = [self._history.doubts[sensor].last_ns] if sensor in self._history.doubts else []
         stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
         return max(stamps_ns, default=now_ns)

@@ -39,7 +39,7 @@ class Check(NamedTuple):
         reason: The word that refusals are counted by.
         when: When an input is refused.
         cells: By kind of input.
-        setting: The settings that change it, "" where there are none.
+        setting: The settings that change it, "" if there are none.
     """
 
     reason: str

@@ -45,7 +45,7 @@ class GateResult(NamedTuple):
     """A frame that passed the gate: its sensor, stamp and pose.
 
     after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None for scans. agreement:
-    how it agrees with the map, None where that was not compared.
+    how it agrees with the map, None if that was not compared.
     """
 
     sensor: str
@@ -56,7 +56,7 @@ class GateResult(NamedTuple):
 
     @property
     def note(self) -> str:
-        """Line for the report, "" where there is nothing to report."""
+        """Line for the report, "" if there is nothing to report."""
         return f"frames of '{self.sensor}' are accepted again after {self.after}" if self.after else ""
 
 
@@ -98,7 +98,7 @@ class Gate:
         return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
 
     def doubt(self, passed: GateResult) -> DisagreementSpell | None:
-        """Return the doubt that frames of its sensor are in, None where they agree."""
+        """Return the doubt that frames of its sensor are in, None if they agree."""
         return self._history.doubts.get(passed.sensor)
 
     def check_agreement(

@@ -126,7 +126,7 @@ def correct(
 
 
 def need_frames(kept: KeptFrames | None, where: str) -> KeptFrames:
-    """Return the kept frames of a map. Raises StereovoxError where there are none; `where`: names the map."""
+    """Return the kept frames of a map. Raises StereovoxError if there are none; `where`: names the map."""
     if kept is None or not len(kept):
         raise StereovoxError(f"{where} did not keep its frames; map again with map.keep_frames=true")
     return kept
@@ -135,7 +135,7 @@ def need_frames(kept: KeptFrames | None, where: str) -> KeptFrames:
 def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config) -> tuple[dict[int, Transform], int]:
     """Return the new poses by number of the frame, and how many poses are of no frame that is kept.
 
-    Poses that a frame already has are left out. Raises StereovoxError where none is of a kept frame, where several
+    Poses that a frame already has are left out. Raises StereovoxError if none is of a kept frame, where several
     frames have a stamp that comes without its sensor, and for poses that are no rigid motions.
     """
     given: dict[FrameKey, Transform] = {key: pose for key, pose in poses.items()}  # noqa: C416 - a type checker refuses dict(poses)
@@ -170,7 +170,7 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
 
 
 def as_corrected(recording: str) -> str:
-    """Return the name of the recording of a map whose poses were corrected; "" where it has none."""
+    """Return the name of the recording of a map whose poses were corrected; "" if it has none."""
     return f"{recording.removesuffix(CORRECTED)}{CORRECTED}" if recording else ""
 
 
@@ -283,7 +283,7 @@ class Rebuild:
         return seen
 
     def _posed(self, frame: KeptFrame) -> KeptFrame:
-        """Return a frame at its new pose, itself where it has none."""
+        """Return a frame at its new pose, itself if it has none."""
         pose = self._moved.get(frame.number)
         return frame if pose is None else replace(frame, T_world_sensor=pose)
 
@@ -352,7 +352,7 @@ def _without_frames(config: Config) -> Config:
 
 
 def _other_than(tiles: Path | None, storage: Storage) -> Path | None:
-    """Return a folder for tiles beside the one that a map uses."""
+    """Return a folder for tiles next to the one that a map uses."""
     store = storage.tile_store
     return tiles.with_name(f"{tiles.name}-anew") if tiles and store and store.folder == tiles else tiles
 

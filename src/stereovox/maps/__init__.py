@@ -41,7 +41,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
 
 
 def _kept_frames(config: Config, resume: VoxelMap | None) -> KeptFrames | None:
-    """Return where frames are kept, those of `resume` among them. Raises ConfigError where it did not keep its own."""
+    """Return where frames are kept, those of `resume` among them. Raises ConfigError if it did not keep its own."""
     if not config.map.keep_frames:
         return None
     if resume is None:

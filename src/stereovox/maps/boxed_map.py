@@ -31,7 +31,7 @@ from stereovox.maps.storage.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, w
 from stereovox.maps.voxel_map import VoxelMap, unbounded
 
 USUAL_SIDE = 256
-"""Cells along the side of a box where none is asked for."""
+"""Cells along the side of a box if none is asked for."""
 OURS = (f"{BOXES}/", MANIFEST, LOCK, ".writer")
 """Beginnings of the names of all files of a map in boxes."""
 
@@ -262,7 +262,7 @@ def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | No
 
 
 def check_boxed_target(place: Place, ours: tuple[str, ...] = ()) -> None:
-    """Raise MapFileError where a place holds anything but a map in boxes, or what a killed writer left of one.
+    """Raise MapFileError if a place holds anything but a map in boxes, or what a killed writer left of one.
 
     ours: beginnings of the names of other files that belong to it.
     """
@@ -286,7 +286,7 @@ def _as_list(states: Iterable[State]) -> list[State]:
 
 
 def _holding(states: list[State] | None) -> Wanted:
-    """Return what tells whether a box may hold a cell in one of these states."""
+    """Return what reports whether a box may hold a cell in one of these states."""
     if states is None or State.UNKNOWN in states:
         return any_box
     return lambda box: any(getattr(box, State(state).name.lower()) for state in states)

@@ -106,7 +106,7 @@ class GridStorage(Guarded):
         )  # fmt: skip
 
     def stored_at(self, indices: NDArray[np.integer]) -> NDArray[np.integer]:
-        """Return the stored numbers (N,) of cells, column and row (N, 2); "unknown" where there is no tile."""
+        """Return the stored numbers (N,) of cells, column and row (N, 2); "unknown" if there is no tile."""
         found = np.full(len(indices), self.cell_format.unknown, self.cell_format.dtype)
         pool = self._pool
         _grid.look_up(pool.table, pool.coords, pool.values, np.ascontiguousarray(indices, np.int64), found)

@@ -71,7 +71,7 @@ class Raster:
 
 
 def card(title: str, facts: Mapping[str, str], image: NDArray[np.uint8] | None, caption: str) -> str:
-    """Return HTML: facts by name, beside an image (rows, columns, 4) RGBA, if there is one, with a caption.
+    """Return HTML: facts by name, next to an image (rows, columns, 4) RGBA, if there is one, with a caption.
 
     All text is escaped: names of recordings and reasons may come from a file.
     """
@@ -200,7 +200,7 @@ def _surfaces(
 def _highest(
     raster: Raster, cells: NDArray[np.integer], values: NDArray[np.float64], empty: float
 ) -> NDArray[np.float64]:
-    """Return the highest of the values (N,) of the cells (N, 2) in each pixel, `empty` where there is none."""
+    """Return the highest of the values (N,) of the cells (N, 2) in each pixel, `empty` if there is none."""
     order = np.argsort(values, kind="stable")
     image = np.full(raster.shape, empty)
     image[raster.places(cells[order])] = values[order]  # of equal places the last, the highest, stays

@@ -56,7 +56,7 @@ class OccupancyGrid:
 
     @property
     def known_span(self) -> tuple[slice, slice]:
-        """The rows and columns from the first to the last of which a cell is known; both empty where none is."""
+        """The rows and columns from the first to the last of which a cell is known; both empty if none is."""
         known = self.cells != UNKNOWN
         ends = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
         rows, columns = (slice(int(n[0]), int(n[-1]) + 1) if len(n) else slice(0, 0) for n in ends)
@@ -64,7 +64,7 @@ class OccupancyGrid:
 
     @property
     def known_corners(self) -> NDArray[np.float64]:
-        """Corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) where none is."""
+        """Corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) if none is."""
         rows, columns = self.known_span
         if rows.stop == rows.start:
             return np.zeros((0, 2))

@@ -39,7 +39,7 @@ class OnBlocks(OnStorage):
 
     @property
     def kept_frames(self) -> KeptFrames | None:
-        """The depth images of its frames, where `map.keep_frames` asks for them; None where it has none."""
+        """The depth images of its frames, where `map.keep_frames` asks for them; None if it has none."""
         return self.storage.kept
 
     @property

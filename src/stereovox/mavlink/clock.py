@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an autopilot's clock shows, by this machine's: TIMESYNC messages, or else the least delay of what it sends.
 
-TIMESYNC (https://mavlink.io/en/services/timesync.html): we send our time ts1, the autopilot returns it beside its own,
+TIMESYNC (https://mavlink.io/en/services/timesync.html): we send our time ts1, the autopilot returns it next to its own,
 tc1; if both ways take as long, its clock was ahead of ours by tc1 - (ts1 + now) / 2, as in PX4's mavlink_timesync.cpp.
 Of the last answers the one with the shortest round trip counts, whose error is at most half of that.
 """
@@ -75,7 +75,7 @@ class RemoteClock:
 
     @property
     def error_ns(self) -> int | None:
-        """The most by which `offset_ns` is off; None where nobody knows, without TIMESYNC."""
+        """The most by which `offset_ns` is off; None if nobody knows, without TIMESYNC."""
         with self._lock:
             return min(self._answers)[0] // 2 if self._answers else None
 

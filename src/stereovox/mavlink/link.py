@@ -31,7 +31,7 @@ def warn(line: str) -> None:
 
 
 def dialect() -> ModuleType:
-    """Return pymavlink's messages of MAVLink 2; raises MissingExtra where it is not installed."""
+    """Return pymavlink's messages of MAVLink 2; raises MissingExtra if it is not installed."""
     try:
         from pymavlink.dialects.v20 import ardupilotmega
     except ImportError:

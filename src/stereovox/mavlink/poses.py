@@ -51,7 +51,7 @@ class PoseReceiver:
 
     Where ODOMETRY says that the autopilot's estimate was reset (`reset_counter`), the poses after it are shifted and
     turned about the vertical so that they go on from those before it: what is mapped stays right, in a world that is
-    no longer the autopilot's. So it is told, and also where too much time passed for that.
+    no longer the autopilot's. So it is reported, and also if too much time passed for that.
 
     Args:
         connection: A `MavlinkLink`, or the address of one, which is then closed with the receiver.
@@ -196,7 +196,7 @@ class PoseReceiver:
         self._tell(f"{words}: poses go on from those before it")
 
     def _expected(self, stamp_ns: int) -> Transform | None:
-        """Return where the body is if it went on as between its last two poses, None where that is long ago."""
+        """Return where the body is if it went on as between its last two poses, None if that is long ago."""
         if len(self._recent) < 2:
             return None
         (first_ns, first), (then_ns, then) = self._recent
@@ -229,7 +229,7 @@ def receive_poses(connection: str | MavlinkLink, into: TakesPoses, *, tell: Tell
 
 
 def _pose(xyz: list[float], wxyz: list[float]) -> Transform | None:
-    """Return the motion of a position and a quaternion w, x, y, z; None where they are no such thing."""
+    """Return the motion of a position and a quaternion w, x, y, z; None if they are no such thing."""
     w, x, y, z = wxyz
     if not all(map(isfinite, (*xyz, *wxyz))) or abs(np.linalg.norm(wxyz) - 1) > MAX_LENGTH_ERROR:
         return None

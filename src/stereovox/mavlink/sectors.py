@@ -197,7 +197,7 @@ class _Columns:
         self.own = np.hypot(x.mean(axis=0), y.mean(axis=0)) <= rules.own_radius
 
     def nearest(self, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the distance (72,) of the nearest chosen column in each sector, infinite where there is none."""
+        """Return the distance (72,) of the nearest chosen column in each sector, infinite if there is none."""
         row, column = np.nonzero(chosen & self._within)
         away = self._away[row, column]
         first, last = self._reach(row, column)
@@ -237,7 +237,7 @@ def _spans(
 
 
 def check_number_of_cells(low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
-    """Raise StereovoxError where a box of cells is too large to be looked at for each message."""
+    """Raise StereovoxError if a box of cells is too large to be looked at for each message."""
     number = np.prod((high - low + 1).astype(float))
     if number > MAX_CELLS:
         raise StereovoxError(f"{number:.0f} cells for one message; lessen max_distance, or map with larger cells")

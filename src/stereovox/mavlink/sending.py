@@ -33,7 +33,7 @@ POSE_SHARE = 0.6
 class ObstacleSender:
     """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D where that is asked for.
 
-    It is an `Observer` for `map_recording`, and `after` may be called beside any `Mapper.add`. A thread of its own
+    It is an `Observer` for `map_recording`, and `after` may be called next to any `Mapper.add`. A thread of its own
     reads the map; each message is for where the body is by its newest pose, of a frame that the map took in (`after`,
     `at`) or without one (`pose`), carried on to the present by the motion between the last two. It waits up to half a
     period for the next frame. Unknown space ends what is free, as `SectorRules.unknown` says.
@@ -176,7 +176,9 @@ class ObstacleSender:
         """
         try:
             why = self._send()
-        except Exception as error:  # whatever is wrong, nothing is sent, the user is told, and the next try may succeed
+        except (
+            Exception
+        ) as error:  # whatever is wrong, nothing is sent, the user is reported, and the next try may succeed
             why = f"{type(error).__name__}: {error}" if not isinstance(error, StereovoxError) else str(error)
         if bool(why) != bool(self._why):
             self._tell(f"no obstacle distances are sent: {why}" if why else "obstacle distances are sent again")
@@ -184,7 +186,7 @@ class ObstacleSender:
         return why
 
     def _send(self) -> str:
-        """Send what the map says now; return why not, nothing where it was sent."""
+        """Send what the map says now; return why not, nothing if it was sent."""
         health, newest = self._mapper.health(), self._body.newest
         if newest is None or not health.ages_s:
             return ""  # nothing has come yet, which is no news

@@ -23,11 +23,11 @@ class Transport(Protocol):
     """A way for bytes; one thread reads, another may write meanwhile."""
 
     def read(self, seconds: float) -> bytes:
-        """Return what came within so many seconds; nothing if nothing did. Raises OSError where the way is gone."""
+        """Return what came within so many seconds; nothing if nothing did. Raises OSError if the way is gone."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; datagrams may be lost. Raises OSError where the way is gone."""
+        """Send bytes; datagrams may be lost. Raises OSError if the way is gone."""
         ...
 
     def close(self) -> None:
@@ -36,7 +36,7 @@ class Transport(Protocol):
 
 
 def open_transport(url: str) -> Transport:
-    """Return the way to an autopilot that a text names; raises StereovoxError for others and where there is none."""
+    """Return the way to an autopilot that a text names; raises StereovoxError for others and if there is none."""
     kind, _, rest = url.partition(":")
     place, _, number = rest.rpartition(":")
     if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal() or len(number) > 9:

@@ -86,7 +86,7 @@ def _rise(stored, prior, turn, low, rest, x, y, z, lately):
 
 @cell
 def _tentative(stored, rules, number):
-    """Return the tentative number nearest to one; unknown, or the lowest that is not free, where there is none."""
+    """Return the tentative number nearest to one; unknown, or the lowest that is not free, if there is none."""
     number = max(min(number, np.int32(rules.occupied_least - ONE)), np.int32(rules.free_most + ONE))
     room = number == stored.unknown and number + ONE < rules.occupied_least
     return np.int32(number + (ONE if room else NIL))

@@ -72,7 +72,7 @@ def _number(bits):
 
 @cell
 def _count(mask, runs):
-    """Write how many rows off the next obstacle of the same lane is, FAR where there is none."""
+    """Write how many rows off the next obstacle of the same lane is, FAR if there is none."""
     rows, padded = mask.shape
     for c in range(padded):
         runs[0, c] = NEAR if mask[0, c] else FAR

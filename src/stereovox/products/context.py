@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a map says besides its cells, and what each output does with it: nothing leaves a map without an answer to that.
 
-`OUTPUTS` is the table. Each cell begins with what is done: `uses` it, `refuses` where it is bad, `carries along` what
+`OUTPUTS` is the table. Each cell begins with what is done: `uses` it, `refuses` if it is bad, `carries along` what
 says it, or `not meaningful, because` of something. A test walks the table with a bad case for each cell that uses or
 refuses, and fails for an output that is not in it.
 """
@@ -55,7 +55,7 @@ class MapContext:
 
     @property
     def stale(self) -> str:
-        """Why the map is too old to be acted on; "" where it is not, or it is no live map."""
+        """Why the map is too old to be acted on; "" if it is not, or it is no live map."""
         return self.health.text if self.health is not None and self.health.state in STALE else ""
 
 

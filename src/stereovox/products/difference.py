@@ -46,7 +46,7 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
     Args:
         a: The earlier map.
         b: The later map.
-        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None where they are the same.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None if they are the same.
 
     Returns:
         The changes.
@@ -71,7 +71,7 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
 def write_difference(changes: Difference, cell: tuple[float, float, float], path: str | Path) -> None:
     """Write the arrays of a `Difference` for `numpy.load`, and `cell`, the sides of a cell in metres.
 
-    Raises MapFileError where the file cannot be written.
+    Raises MapFileError if the file cannot be written.
     """
     with replacing(path) as file:
         np.savez_compressed(file, cell=np.array(cell), **asdict(changes))

@@ -146,7 +146,7 @@ class DistanceField:
         """Return the gradient of the distance, which points away from the nearest obstacle.
 
         Its length is about 1, and smaller midway between obstacles. Central differences; one-sided at the border of the
-        box and beside cells without a distance.
+        box and next to cells without a distance.
 
         Args:
             points: (N, 3) metres, world frame.
@@ -238,7 +238,7 @@ def write_distance(field: DistanceField, path: str | Path) -> None:
 
     Arrays: `distance` (x, y, z) float32 metres, infinite where no obstacle is near enough; `origin` (3,) metres, lowest
     corner of cell [0, 0, 0]; `cell` (3,) metres, its sides. The centre of cell (i, j, k) is at origin + (i + 0.5, ...)
-    * cell. Raises StereovoxError for an ending other than .npz, MapFileError where the file cannot be written.
+    * cell. Raises StereovoxError for an ending other than .npz, MapFileError if the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise StereovoxError(f"{path}: distances are written as .npz; name the file so")

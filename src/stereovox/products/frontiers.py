@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frontiers: groups of free cells beside unknown ones (Yamauchi 1997), each with a place to view it from."""
+"""Frontiers: groups of free cells next to unknown ones (Yamauchi 1997), each with a place to view it from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NOT_FREE = (State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """Connected free cells beside unknown ones.
+    """Connected free cells next to unknown ones.
 
     Attributes:
         cells: (N, 3) int32, ascending.
@@ -105,7 +105,7 @@ def write_frontiers(found: Sequence[Frontier], path: str | Path) -> None:
     """Write frontiers for `numpy.load`.
 
     Arrays: `cells` (N, 3) int32, `frontier` (N,) int32, the number of the frontier of each cell; `centroid` (K, 3) and
-    `look_from` (K, 3) in metres, NaN where there is none. Raises MapFileError where the file cannot be written.
+    `look_from` (K, 3) in metres, NaN if there is none. Raises MapFileError if the file cannot be written.
     """
     no_viewpoint = np.full(3, np.nan)
     with replacing(path) as file:

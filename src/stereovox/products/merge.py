@@ -33,7 +33,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     Args:
         a: A map, whose settings the result has.
         b: Another map.
-        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None where they are the same.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None if they are the same.
 
     Returns:
         An unbounded map.
@@ -70,7 +70,7 @@ def _summed(a: VoxelMap, mine: NDArray[np.integer], b: VoxelMap, theirs: NDArray
 
 
 def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | None) -> NDArray[np.uint32]:
-    """Return the later time (n, 512) of each cell of blocks (n, 3), from `start_ns` on; NEVER where none is kept."""
+    """Return the later time (n, 512) of each cell of blocks (n, 3), from `start_ns` on; NEVER if none is kept."""
     times = np.full((len(coords), CELLS), NEVER, np.int64)
     for one in (a, b):
         if one.config.map.keep_times and one.storage.times_start_ns is not None and start_ns is not None:

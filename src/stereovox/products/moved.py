@@ -47,7 +47,7 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     obstacle in the cells it overlaps counts by its share of the cell;
     - one that would be free, but overlaps an unknown cell, is unknown.
 
-    Raises StereovoxError where T_a_b is no rigid motion, or leads too far away.
+    Raises StereovoxError if T_a_b is no rigid motion, or leads too far away.
     """
     T, config = rigid(T_a_b), voxel_map.config
     if config.up_direction is not None:
@@ -108,7 +108,7 @@ def level_transform(up_direction: ArrayLike) -> Transform:
 
 
 def rigid(T: ArrayLike) -> Transform:
-    """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError where it is none."""
+    """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError if it is none."""
     T = np.asarray(T, float)
     error = rigidity_error(T)
     if not error <= RIGID:

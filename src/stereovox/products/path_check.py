@@ -28,7 +28,7 @@ class PathCheck(NamedTuple):
         worst: (N,) uint8, the worst `State` that the ball touches on each segment (`check_capsules`).
         blocked_at: Metres along the path until the ball touches a blocking cell; None if it reaches the end.
         oldest_s: (N,) float32 seconds since the last evidence of the stalest known cell that a segment touches; NaN
-            where it touches none. None where the map keeps no times.
+            where it touches none. None if the map keeps no times.
     """
 
     worst: NDArray[np.uint8]
@@ -106,7 +106,7 @@ def _free_share(
 def _oldest(
     voxel_map: VoxelMap, points: NDArray[np.float64], radius: float, now_ns: int | None
 ) -> NDArray[np.float32] | None:
-    """Return the age (N,) in seconds of the oldest evidence that each segment touches, None where no times are kept."""
+    """Return the age (N,) in seconds of the oldest evidence that each segment touches, None if no times are kept."""
     if not voxel_map.config.map.keep_times:
         return None
     cell, bounds = np.array(voxel_map.config.cell), voxel_map.bounds()

@@ -38,7 +38,7 @@ def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
 
 
 def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
-    """Raise StereovoxError where two maps differ in cell size, or, without a transform, in what is up."""
+    """Raise StereovoxError if two maps differ in cell size, or, without a transform, in what is up."""
     if T_a_b is None and a.config.up != b.config.up:
         raise StereovoxError(
             f"up is {a.config.up} in one map and {b.config.up} in the other; give the transform between them"

@@ -92,7 +92,7 @@ class Transform:
 
     @property
     def metres(self) -> NDArray[np.float32]:
-        """Distances of all cells in metres, axes as the box has them, infinite where there is no obstacle; a view."""
+        """Distances of all cells in metres, axes as the box has them, infinite if there is no obstacle; a view."""
         return self.as_box(self.field.metres.swapaxes(0, 1))
 
     def as_box(self, cells: NDArray) -> NDArray:
@@ -127,7 +127,7 @@ def transformed(
 ) -> NDArray[np.float32]:
     """Return the distance (x, y, z) float32 in metres of each cell to the nearest one in `mask` (x, y, z) bool.
 
-    sides: of a cell, (3,) metres. Infinite where none is near enough. max_distance, nearer: see `Transform`.
+    sides: of a cell, (3,) metres. Infinite if none is near enough. max_distance, nearer: see `Transform`.
     """
     transform = Transform(mask.shape, sides, max_distance, nearer)
     transform.field.mask[:, :, : transform.lanes] = mask.transpose(transform.order)

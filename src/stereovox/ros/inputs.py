@@ -2,7 +2,7 @@
 """Convert messages (CDR bytes) to frames and scans with the bag readers, so that a bag and its replay give the same.
 
 A frame waits for its pose, so a message is read twice: `header` gives its time and frame, `frame` converts it. Whatever
-a message holds, `frame` returns a frame: with a `fault` where it cannot be used.
+a message holds, `frame` returns a frame: with a `fault` if it cannot be used.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class DepthInput(Input):
             self._camera = camera
 
     def view(self, data: bytes, stamp_ns: int) -> Frame | Cloud:
-        """Return a depth image without its pose; an empty cloud where it cannot be read."""
+        """Return a depth image without its pose; an empty cloud if it cannot be read."""
         image = DepthInput.frame(self, data, lambda *_: Pose(NO_POSE, NO_POSE, 0))
         return super().view(data, stamp_ns) if image.fault else replace(image, stamp_ns=stamp_ns)
 

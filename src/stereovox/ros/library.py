@@ -47,7 +47,7 @@ def check_installed() -> None:
 
 
 def optional_message(package: str, name: str) -> Any | None:
-    """Return a message class of an optional package, None where it is not installed."""
+    """Return a message class of an optional package, None if it is not installed."""
     try:
         return getattr(import_module(f"{package}.msg"), name)
     except ImportError:

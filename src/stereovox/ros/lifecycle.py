@@ -60,7 +60,7 @@ class Run(Protocol):
     map_node: MapNode
 
     def step(self) -> None:
-        """Do what is due beside mapping, such as saving it."""
+        """Do what is due next to mapping, such as saving it."""
 
     def end(self) -> dict[str, Any]:
         """Map what waits, save the map, release everything; return figures for the report."""

@@ -87,7 +87,7 @@ class Mapping:
         return self.mapper.health()
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the 2-D map; None where nothing is known."""
+        """Return the 2-D map; None if nothing is known."""
         return self._above()
 
     def snapshot(self) -> Callable[[], VoxelMap] | None:

@@ -24,7 +24,7 @@ def write_nav2(folder: str | Path, params: str | Path | None = None) -> list[Pat
     and free rays as observation sources, and the Collision Monitor's source.
 
     Args:
-        folder: Where to; made where it is missing. Older files of these names are replaced.
+        folder: Where to; made if it is missing. Older files of these names are replaced.
         params: The `nav2_params.yaml` to lay ours over; None: that of the sourced distribution's nav2_bringup.
 
     Returns:

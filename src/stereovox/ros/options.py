@@ -36,7 +36,7 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrid
 class Options:
     """Options of the command, and parameters of the node with the prefix `ros.`.
 
-    depth: topics of depth images; `TOPIC=INFO` where the camera_info is not beside it. cloud, scan: topics.
+    depth: topics of depth images; `TOPIC=INFO` where the camera_info is not next to it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
     poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images;
@@ -209,7 +209,7 @@ def _as_kind(name: str, value: Any, default: Any) -> Any:
 
 
 def split_pair(text: str) -> tuple[str, str]:
-    """Split `TOPIC=OTHER` into both sides; the second is "" where there is none."""
+    """Split `TOPIC=OTHER` into both sides; the second is "" if there is none."""
     first, _, second = text.partition("=")
     return first.strip(), second.strip()
 

@@ -67,7 +67,7 @@ class Score:
             self._work.put(partial(error_of, grid, self._reference, self._exclude))
 
     def final(self) -> dict[str, object]:
-        """Score the map as it is, and return Eq 7 and its parts in per cent; empty where there is no map."""
+        """Score the map as it is, and return Eq 7 and its parts in per cent; empty if there is no map."""
         self._work.drop()
         self._busy = False
         if (grid := self._grid()) is not None:

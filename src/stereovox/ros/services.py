@@ -12,7 +12,7 @@ from stereovox.ros.mapping import Mapping
 
 
 def check_continuable(path: str, continuable: bool) -> None:
-    """Raise StereovoxError where a map cannot be continued because each run has a frame of its own."""
+    """Raise StereovoxError if a map cannot be continued because each run has a frame of its own."""
     if not continuable:
         raise StereovoxError(
             f"{path}: a tracked camera, or SLAM, does not know where it is in an older map; begin a new one"

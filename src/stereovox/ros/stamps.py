@@ -20,11 +20,11 @@ class StampsByNode:
             self._is_it = -AHEAD_NS <= self._now_ns() - stamp_ns <= EPOCH_NS
 
     def now_ns(self) -> int | None:
-        """Return the present time by the clock of the stamps; None where it is not known."""
+        """Return the present time by the clock of the stamps; None if it is not known."""
         return self._now_ns() if self._is_it else None
 
     def late(self, stamp_ns: int) -> str:
-        """Return why what is stamped so is too old to be published; "" where it is not, or nobody knows."""
+        """Return why what is stamped so is too old to be published; "" if it is not, or nobody knows."""
         self.heard(stamp_ns)
         age_s = (self._now_ns() - stamp_ns) / 1e9
         old = self._is_it and age_s > self._stale_s

@@ -39,7 +39,7 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
             those of the recording, corrected by the images. None: given where there are any, else tracked.
 
     Raises:
-        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` where there are none.
+        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` if there are none.
     """
     if poses not in (None, *CHOICES):
         raise StereovoxError(
@@ -71,7 +71,7 @@ def poses_of(recording: str) -> str:
 
 
 def _choice(source: Stream, poses: str | None) -> Choice:
-    """Return which poses of an open source are used; raises NoPoses for `both` where it has none."""
+    """Return which poses of an open source are used; raises NoPoses for `both` if it has none."""
     if poses in (GIVEN, TRACK):
         return Choice(source, poses)
     missing = _missing(source)
@@ -81,7 +81,7 @@ def _choice(source: Stream, poses: str | None) -> Choice:
 
 
 def _missing(source: Stream) -> str:
-    """Return why a source has no poses, empty where it has some."""
+    """Return why a source has no poses, empty if it has some."""
     read = getattr(source, "frame", None)
     if read is None or not source.length:
         return (

@@ -89,14 +89,14 @@ class MapResult(Generic[MapT]):
         out: Where it was saved.
         reports: One report for each frame of this run, in order.
         dropped: Number of frames that a live camera delivered while the mapper was busy.
-        track: The robot's trajectory in the map, from `map_floor`; None where the odometry's poses were used.
-        doubts: Why the map may be wrong, from `map_floor` with SLAM; empty where its self-check found nothing.
+        track: The robot's trajectory in the map, from `map_floor`; None if the odometry's poses were used.
+        doubts: Why the map may be wrong, from `map_floor` with SLAM; empty if its self-check found nothing.
         poses: Which were used: `given`, `track` or `both`.
         lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
         believed: Of poses `both`, the number of frames in which nothing known was in view, so that the recording's own
             motion was taken as it is.
         imu: What was made of the IMU of a camera that was tracked, in words; "" without one.
-        loops: Which loops were closed; None where none were sought.
+        loops: Which loops were closed; None if none were sought.
     """
 
     map: MapT
@@ -363,9 +363,9 @@ class MapRun:
         return chosen, lines
 
     def _level_direction(self, settings: Mapping[str, Any]) -> tuple[float, float, float] | None:
-        """Return what is up in the recording's world, None where it is not to be levelled.
+        """Return what is up in the recording's world, None if it is not to be levelled.
 
-        Raises StereovoxError where nobody says it.
+        Raises StereovoxError if nobody says it.
         """
         if not self._level:
             return None
@@ -385,7 +385,7 @@ class MapRun:
         settings = self._profile
         if settings is None:
             settings = saved.config if saved else "default"
-        tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
+        tiles = self.out.parent / f".{self.out.name}-tiles"  # next to the map, not in a temporary folder in memory
         config = load_config(settings, **{**self._overrides, **suggested})
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
 
@@ -575,7 +575,7 @@ class Checkpoints:
             self._due = done + max(self._seconds, REST * (done - start))
 
     def save(self, frames: int) -> None:
-        """Save now. Raises MapFileError where that fails: one line that also says what was saved before."""
+        """Save now. Raises MapFileError if that fails: one line that also says what was saved before."""
         try:
             self._save()
         except MapFileError as error:

@@ -99,7 +99,7 @@ class Survey:
         depth_m: (3,) metres: 5th, 50th and 95th percentile of the depths; None for stereo pairs.
         without_value: Share of pixels without depth; None for stereo pairs.
         depths_m: (N,) metres, a sample of all depths; empty for stereo pairs.
-        unit: Unit of the depth images in words; None where it is not known.
+        unit: Unit of the depth images in words; None if it is not known.
         unit_m: The same in metres.
         unit_sure: Whether the images themselves confirm it.
         unit_why: What speaks for the unit.
@@ -191,7 +191,7 @@ class Survey:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second; None where the recording has no times."""
+        """Frames a second; None if the recording has no times."""
         return (self.frames - 1) / self.seconds if self.seconds > 0 else None
 
 
@@ -250,7 +250,7 @@ def find_up(source: Any, frames: list[AnyFrame]) -> UpEstimate:
         frames: Some of its frames, with poses.
 
     Returns:
-        The direction; not `sure` where the camera was turned over or saw no horizontal surface.
+        The direction; not `sure` if the camera was turned over or saw no horizontal surface.
     """
     known = getattr(source, "up", None)
     if known:
@@ -369,13 +369,13 @@ def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
 
 
 def _ranges(cloud: Cloud) -> NDArray[np.float64]:
-    """Return a sample of a cloud's ranges in metres, NaN where there is none."""
+    """Return a sample of a cloud's ranges in metres, NaN if there is none."""
     ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
     return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
 
 
 def _depth_m(frame: Frame) -> NDArray[np.float64]:
-    """Return a sample of an image's depths in metres, NaN where there is none."""
+    """Return a sample of an image's depths in metres, NaN if there is none."""
     step = max(1, frame.depth.shape[1] // 160)
     depth = frame.depth[::step, ::step].astype(np.float64)
     depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan

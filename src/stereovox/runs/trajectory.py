@@ -261,7 +261,7 @@ class _Run:
         )
 
     def given(self, stream: Stream, source: Any, frames: str | None) -> NDArray[np.float64]:
-        """Return the recording's own poses (N, 4, 4), NaN where there are none."""
+        """Return the recording's own poses (N, 4, 4), NaN if there are none."""
         given = np.array(self._given).reshape(-1, 4, 4)
         if getattr(stream, "posed", True) and np.isfinite(given).any():
             return given
@@ -277,7 +277,7 @@ class _Run:
 
 
 def _own_poses(source: Stream) -> NDArray[np.float64]:
-    """Return the poses (N, 4, 4) of a recording, NaN where there is none; without its images where it can do so."""
+    """Return the poses (N, 4, 4) of a recording, NaN if there is none; without its images where it can do so."""
     read = pose_reader(source)
     if read is None:
         poses = [_own_pose(frame) for frame in source]
@@ -298,7 +298,7 @@ def _own_pose(frame: AnyFrame) -> NDArray[np.float64]:
 
 
 def _score(found: CameraTrack, given: NDArray[np.float64]) -> TrajectoryScore | None:
-    """Compare with the recording's own poses; None where there are too few, or the camera stands still."""
+    """Compare with the recording's own poses; None if there are too few, or the camera stands still."""
     known = np.isfinite(given).all(axis=(1, 2))
     if not known.any():
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simple model of a RealSense D435: disparity noise, holes beside edges, near and far limits, reasons told."""
+"""A simple model of a RealSense D435: disparity noise, holes next to edges, near and far limits, reasons told."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class D435:
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
-        true_depth_m: (height, width) along the optical axis, inf where there is nothing. Same seed, same image.
+        true_depth_m: (height, width) along the optical axis, inf if there is nothing. Same seed, same image.
         T_world_camera: for cameras whose errors stay with surfaces.
         """
         random = np.random.default_rng(seed)
@@ -144,7 +144,7 @@ def beside_nearer_surface(disparity: NDArray[np.float32], radius: int) -> NDArra
 
 
 def on_border(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels have a farther surface right beside them."""
+    """Return which pixels have a farther surface right next to them."""
     return extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
 
 

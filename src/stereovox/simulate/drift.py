@@ -24,7 +24,7 @@ def drifting(path: CameraPath, seconds: float, share: float, random: np.random.G
 
     path: the true one, world z up; it takes `seconds`. share: metres of error per metre travelled, in all directions;
     the heading drifts along (`YAW_DEG`), roll and pitch stay right. The first pose is true, and errors belong to places
-    on the way, not to images: they are the same for any number of frames. Raises StereovoxError where the first pose
+    on the way, not to images: they are the same for any number of frames. Raises StereovoxError if the first pose
     has no heading.
     """
     shares = np.linspace(0, 1, max(2, math.ceil(seconds / STEP_S) + 1))

@@ -56,7 +56,7 @@ class RealisticDepthCamera(D435):
     edge_px: within so many pixels of a step in depth a pixel is lost (share `edge_loss`) or measures something
         between (share `flying`).
     holes: share of pixels without value anywhere; with it come `holes_far` at `farthest`, less before as the square of
-        the depth, `holes_steep` where surfaces are seen from the side, `holes_dark` where they are black.
+        the depth, `holes_steep` where surfaces are seen from the side, `holes_dark` if they are black.
     hole_px: standard deviation of the Gaussian that makes holes patchy.
     repetitive: share of the surfaces whose texture repeats each `period` metres; `mismatched`: share of their far
         pixels whose disparity is too large by that period: they seem too near.
@@ -80,9 +80,9 @@ class RealisticDepthCamera(D435):
     def measure(
         self, true_depth_m: NDArray[np.floating], seed: int | list[int], T_world_camera: Transform | None = None
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Return depth in whole millimetres, 0 where there is none, and the reason: UNKNOWN, it does not say why.
+        """Return depth in whole millimetres, 0 if there is none, and the reason: UNKNOWN, it does not say why.
 
-        true_depth_m: (height, width) along the optical axis, inf where there is nothing. seed: the first number is that
+        true_depth_m: (height, width) along the optical axis, inf if there is nothing. seed: the first number is that
         of what stays with surfaces and pixels, all of them that of the rest. T_world_camera: (4, 4), where the camera
         stands.
         """
@@ -119,7 +119,7 @@ class RealisticDepthCamera(D435):
         return np.where(wrong, true + np.float32(self.period * self.camera.fx) / there.depth, true)
 
     def _at_edges(self, disparity: Image, true: Image, random: np.random.Generator) -> tuple[Image, NDArray[np.bool_]]:
-        """Return the disparity with flying pixels between fore- and background, and what is lost beside edges."""
+        """Return the disparity with flying pixels between fore- and background, and what is lost next to edges."""
         import cv2
 
         near, far = extreme(np.maximum, true, self.edge_px), extreme(np.minimum, true, self.edge_px)
@@ -163,7 +163,7 @@ def honest_kinect(width: int = WIDTH) -> RealisticDepthCamera:
 class _Places:
     """Where on surfaces the pixels of an image look.
 
-    depth: (height, width) float32 metres, where nothing is that of the farthest thing a camera could see. points:
+    depth: (height, width) float32 metres, if nothing is that of the farthest thing a camera could see. points:
     (height * width, 3) float32 in the world, metres. x, y: slopes of the rays. fx, fy: focal lengths in pixels.
     """
 

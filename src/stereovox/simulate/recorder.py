@@ -61,7 +61,7 @@ def record(
 
     T_tracker_camera: the true mount, both bodies in optical axes. calibrated: whether `pair.toml` tells mount and
     clock; `world`: its key of that name. Depth is written in whole millimetres, 0 for none; the reason of a missing
-    value is lost, as in any file of a D435. Raises SourceError where the folder holds something.
+    value is lost, as in any file of a D435. Raises SourceError if the folder holds something.
     """
     tracker = tracker or T265()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -80,7 +80,7 @@ class Scene:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
         """Return what `cast` does, the unit normals (N, 3) of the surfaces met, and their triangles (N,), -1: none.
 
-        Normals are outward, 0 where there is none.
+        Normals are outward, 0 if there is none.
         """
         share, met = self._tree.nearest(np.array(origin, np.float64), np.asarray(directions, np.float32))
         return share, np.where(met[:, None] < 0, np.float32(0), self._normals[met]), met

@@ -117,8 +117,8 @@ class Simulation(DepthSource):
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
     itself and is always the same for the same `seed`.
     Reasons of the `simple` camera are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be
-    free no farther), UNMATCHED beside edges and where the right eye sees nothing. The others do not say why.
-    noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
+    free no farther), UNMATCHED next to edges and where the right eye sees nothing. The others do not say why.
+    noise: False gives exact depth in metres (float32, inf if nothing is) without noise or holes.
     frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
     Raises SourceError for an unknown scene or parameter and for values out of range.
     """
@@ -172,7 +172,7 @@ class Simulation(DepthSource):
         return self.observe(i, self.true_depth(i))
 
     def true_depth(self, i: int) -> NDArray[np.float32]:
-        """Return the exact depth (height, width) in metres along the optical axis, inf where nothing is; read only."""
+        """Return the exact depth (height, width) in metres along the optical axis, inf if nothing is; read only."""
         T = self._world.path(self._share(i))  # the frame of the poses must not change the image
         seen = self._seen
         if seen is None or not np.array_equal(seen[0], T):
@@ -219,7 +219,7 @@ class Simulation(DepthSource):
         )
 
     def _photo(self, i: int) -> Photo | None:
-        """Return the grey image of frame `i`, taken once it is needed; None where none is asked for."""
+        """Return the grey image of frame `i`, taken once it is needed; None if none is asked for."""
         if not self.options.photo:
             return None
         camera = self.camera

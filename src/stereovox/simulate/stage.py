@@ -91,12 +91,12 @@ def moved(scene: Scene, T_new_world: Transform) -> Scene:
 
 
 def within(name: str, value: float, low: float, high: float) -> None:
-    """Raise SourceError where a parameter leaves its limits."""
+    """Raise SourceError if a parameter leaves its limits."""
     if not low <= value <= high:
         raise SourceError(f"{name}={value:g} must lie between {low:g} and {high:g}")
 
 
 def one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    """Raise SourceError where a parameter is not one of the known words."""
+    """Raise SourceError if a parameter is not one of the known words."""
     if value not in known:
         raise SourceError(f"{name}={value} is unknown; use {' or '.join(known)}")

@@ -184,7 +184,7 @@ def drifted(
 def start_frame(T_world_first: Transform) -> Transform:
     """Return T_start_world (4, 4): the world that the tracker derives from its first pose, in OpenGL axes.
 
-    T_world_first: body in optical axes, world z up. Raises StereovoxError where it has no heading.
+    T_world_first: body in optical axes, world z up. Raises StereovoxError if it has no heading.
     """
     ahead = T_world_first[:3, 2] * [1, 1, 0]
     if np.linalg.norm(ahead) < 1e-6:

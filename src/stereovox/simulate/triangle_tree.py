@@ -34,7 +34,7 @@ class TriangleTree:
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return how often `directions` (N, 3) fits between `origin` (3,) and the first triangle, and which it is.
 
-        float32, inf where there is none; int32, -1 where there is none. A triangle without area is never met, and a
+        float32, inf if there is none; int32, -1 if there is none. A triangle without area is never met, and a
         ray on the side of two always meets one of them. Releases the GIL.
         """
         share, number = np.empty(len(directions), np.float32), np.empty(len(directions), np.int32)

@@ -34,7 +34,7 @@ IMU = "imu0"
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders with poses, the best first: EuRoC's estimate, TUM VI's motion capture, EuRoC's."""
 TEXTS = ("poses.txt", "groundtruth.txt")
-"""Files of poses of the body in TUM format, where there are no such folders."""
+"""Files of poses of the body in TUM format, if there are no such folders."""
 CHAINS = ("camchain.yaml", "dso/camchain.yaml")
 """Calibrations of Kalibr that stand in for sensor.yaml; TUM VI has the second."""
 SAME_NS = 1_000_000
@@ -100,7 +100,7 @@ class AslRig(RigSource):
         return as_body(poses, T_body_left, options["axes"], options["invert"])
 
     def imu(self) -> ImuReadings | None:
-        """Return the readings of imu0; raises SourceError where they are damaged."""
+        """Return the readings of imu0; raises SourceError if they are damaged."""
         if self._imu is None or not os.path.isfile(self._root / self._imu / DATA):
             return None
         return _readings(self._root / self._imu, self.pairs[0].T_body_camera)
@@ -133,7 +133,7 @@ class _Images:
         self.stamps = sorted(self.files)
 
     def nearest(self, stamp_ns: int) -> Path:
-        """Return the image of a time, or the name it would have where none is near."""
+        """Return the image of a time, or the name it would have if none is near."""
         after = bisect_left(self.stamps, stamp_ns)
         near = self.stamps[max(after - 1, 0) : after + 1]
         best = min(near, key=lambda stamp: abs(stamp - stamp_ns))
@@ -141,7 +141,7 @@ class _Images:
 
 
 def _root(where: str) -> Path | None:
-    """Return the folder that holds the cameras, None where there is none."""
+    """Return the folder that holds the cameras, None if missing."""
     for root in (Path(where) / ROOT, Path(where)):
         for eye in EYES:
             if any(os.path.exists(root / eye / name) for name in (DATA, SENSOR, "data")):
@@ -203,7 +203,7 @@ def _truth(folder: Path) -> Poses:
 
 
 def _mount(path: Path) -> Transform:
-    """Return T_BS (4, 4), which maps the frame of the poses into the body's; the identity where nothing is said."""
+    """Return T_BS (4, 4), which maps the frame of the poses into the body's; the identity if nothing is said."""
     table = read_yaml(path) if os.path.isfile(path) else {}
     try:
         return rigid(table["T_BS"], "T_BS") if "T_BS" in table else np.eye(4)

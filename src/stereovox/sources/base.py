@@ -48,7 +48,7 @@ class Part(NamedTuple):
     """Part of a recording that a layout needs.
 
     patterns: names inside the folder as in `glob`, of which one must be there; the first is the usual one. what: what
-    it holds, in words. cure: what to do where it is missing, if that is not just to put it there.
+    it holds, in words. cure: what to do if it is missing, if that is not just to put it there.
     """
 
     patterns: tuple[str, ...]
@@ -71,7 +71,7 @@ class Stream(Protocol):
     """Frames in time order from a recording or a live camera; it need not have a length nor be rewindable.
 
     A registered class also has `recognises(where: str) -> bool`, which is cheap and never raises, and is constructed
-    from `where` alone; it raises SourceError where the recording or device as a whole cannot be used.
+    from `where` alone; it raises SourceError if the recording or device as a whole cannot be used.
 
     Attributes:
         name: Short name for messages and reports.
@@ -120,10 +120,10 @@ class Stream(Protocol):
         return self
 
     def imu(self) -> Imu | None:
-        """Read what the IMU beside the camera says.
+        """Read what the IMU next to the camera says.
 
         Returns:
-            Its readings, by the clock of the images; None where there is no IMU.
+            Its readings, by the clock of the images; None if there is no IMU.
 
         Raises:
             SourceError: There is one that cannot be used.
@@ -149,7 +149,7 @@ class Source(Stream, Protocol):
         """Measure which way is up by an accelerometer.
 
         Returns:
-            Unit vector (3,) in the world of the poses; None where the recording has nothing that tells.
+            Unit vector (3,) in the world of the poses; None if the recording has nothing that tells.
         """
         return None
 
@@ -326,7 +326,7 @@ class Excerpt(Stream):
 
 
 def imu_of(stream: Stream) -> Imu | None:
-    """Return the IMU of a stream, None where it has none; a class of another package may not know of such a thing."""
+    """Return the IMU of a stream, None if it has none; a class of another package may not know of such a thing."""
     read = getattr(stream, "imu", None)
     return read() if read else None
 

@@ -105,7 +105,7 @@ def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KI
 
 
 def file_names(folder: Path) -> list[str]:
-    """Return the names of the entries of `folder`; raises SourceError where it cannot be listed."""
+    """Return the names of the entries of `folder`; raises SourceError if it cannot be listed."""
     try:
         return os.listdir(folder)
     except OSError as error:

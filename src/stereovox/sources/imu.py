@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an inertial measurement unit (IMU) beside a camera says: how fast it turns, and what it feels."""
+"""What an inertial measurement unit (IMU) next to a camera says: how fast it turns, and what it feels."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def in_order(
 ) -> ImuReadings:
     """Return readings of a file, sorted, without those that repeat a time or have no finite angular rate.
 
-    Args as the attributes of `ImuReadings`. Raises SourceError where fewer than two are left.
+    Args as the attributes of `ImuReadings`. Raises SourceError if fewer than two are left.
     """
     stamps = np.asarray(stamps_ns, np.int64)
     rate, force = (np.asarray(rows, float).reshape(-1, 3) for rows in (angular_rate, specific_force))
@@ -148,7 +148,7 @@ def at_times(stamps_ns: NDArray[np.int64], values: NDArray[np.float64], wanted_n
 
 
 def up_of_force(force: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the unit vector (3,) along a mean force, in m/s^2; None where it has not the length of gravity."""
+    """Return the unit vector (3,) along a mean force, in m/s^2; None if it has not the length of gravity."""
     length = float(np.linalg.norm(force))
     return force / length if GRAVITY[0] <= length <= GRAVITY[1] else None
 

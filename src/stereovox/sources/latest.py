@@ -67,7 +67,7 @@ class Latest(Generic[T]):
                     close()
         except Exception as raised:
             error = raised
-        finally:  # also where a library ends the thread: nobody may wait for it
+        finally:  # also if a library ends the thread: nobody may wait for it
             queue.end(error)
 
 

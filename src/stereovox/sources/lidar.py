@@ -50,7 +50,7 @@ class Box:
 
 @runtime_checkable
 class LidarSource(Protocol):
-    """A source that may have a lidar scan beside each frame; `i` as in `Source.frame`."""
+    """A source that may have a lidar scan next to each frame; `i` as in `Source.frame`."""
 
     name: str
     notes: tuple[str, ...]
@@ -63,18 +63,18 @@ class LidarSource(Protocol):
     def __len__(self) -> int: ...
 
     def viewpoint(self, i: int) -> Viewpoint:
-        """Return the rectified left camera of frame `i`, its pose and time; FrameRefused where there is no pose."""
+        """Return the rectified left camera of frame `i`, its pose and time; FrameRefused if there is no pose."""
         ...
 
     def scan(self, i: int) -> LidarScan | None:
-        """Return the scan of frame `i`, None where the recording has none at all.
+        """Return the scan of frame `i`, None if the recording has none at all.
 
         Raises FrameRefused: `missing_file`, `unreadable` (cut off), and what `viewpoint` raises.
         """
         ...
 
     def boxes(self, i: int) -> tuple[Box, ...]:
-        """Return the annotated objects of frame `i`; none where nothing is annotated."""
+        """Return the annotated objects of frame `i`; none if nothing is annotated."""
         ...
 
     def moving(self, i: int) -> NDArray[np.bool_] | None:
@@ -85,7 +85,7 @@ class LidarSource(Protocol):
 def read_velodyne(path: Path) -> NDArray[np.float32]:
     """Return the points (N, 3) float32 of a KITTI `.bin`, those that are not finite left out.
 
-    Raises FrameRefused: `missing_file`; `unreadable` where the file holds no points or is cut off.
+    Raises FrameRefused: `missing_file`; `unreadable` if the file holds no points or is cut off.
     """
     if not os.path.isfile(path):
         raise FrameRefused("missing_file", f"{path}: no such file; put the scan back or leave its frame out")

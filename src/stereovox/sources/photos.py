@@ -20,7 +20,7 @@ from stereovox.sources.images import MAX_BYTES, size_text
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
 """Suffixes of pictures, in lower case."""
 FOLDERS = ("rgb", "color", "colour", "image", "images")
-"""Folders of pictures beside one of depth images."""
+"""Folders of pictures next to one of depth images."""
 ASPECT = 0.01
 """Share by which the ratio of sides may differ for a picture and a depth image to show the same."""
 
@@ -57,7 +57,7 @@ def decode_photo(data: bytes, size: tuple[int, int], name: str) -> NDArray[np.ui
 
 
 def photo_size(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) of the picture in a file, None where it is none that can be read."""
+    """Return (width, height) of the picture in a file, None if it is none that can be read."""
     from PIL import Image
 
     try:
@@ -70,7 +70,7 @@ def photo_size(path: Path) -> tuple[int, int] | None:
 def registered(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera | None:
     """Return the camera of pictures of (width, height) = `size` to which a depth camera's images are registered.
 
-    None where the ratio of their sides is another one: then they do not show the same.
+    None if the ratio of their sides is another one: then they do not show the same.
     """
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > ASPECT:
         return None
@@ -82,7 +82,7 @@ def registered(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera | 
 
 
 def nearest_in_time(stamps_ns: Sequence[int], others_ns: Sequence[int], within_ns: int) -> list[int | None]:
-    """Return for each time the number of the other time that is nearest to it, None where none is near enough."""
+    """Return for each time the number of the other time that is nearest to it, None if none is near enough."""
     order = np.argsort(others_ns, kind="stable")
     others, stamps = np.asarray(others_ns, np.int64)[order], np.asarray(stamps_ns, np.int64)
     if not len(others):

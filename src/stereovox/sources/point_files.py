@@ -75,7 +75,7 @@ def read_points(path: str | Path) -> Points:
 class _Head(NamedTuple):
     """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin.
 
-    faces, shape and turned: as in `Points`; shape is None where there are no rows and columns.
+    faces, shape and turned: as in `Points`; shape is None if there are no rows and columns.
     """
 
     record: list[tuple[str, str, int]]
@@ -155,7 +155,7 @@ def _count(text: str) -> int:
 
 
 def _xyz(body: bytes, head: _Head) -> NDArray[np.float64]:
-    """Return the points (N, 3); raises ValueError where the bytes do not suffice, before room is made for them."""
+    """Return the points (N, 3); raises ValueError if the bytes do not suffice, before room is made for them."""
     names = [name for name, _, _ in head.record]
     if any(names.count(axis) != 1 for axis in "xyz") or any(n > 1 for name, _, n in head.record if name in "xyz"):
         raise ValueError(f"its points have no x, y and z of one number each (they have {shown(' '.join(names))})")

@@ -52,7 +52,7 @@ class Waiting(Generic[T]):
         queue.append(Arrival(sensor, stamp_ns, frame_id, content, self._clock()))
 
     def pop(self, is_ready: Callable[[Arrival[T]], bool]) -> Arrival[T] | None:
-        """Remove and return the next frame, the oldest among the first of each sensor; None where all must wait.
+        """Remove and return the next frame, the oldest among the first of each sensor; None if all must wait.
 
         is_ready: returns whether everything that a frame needs is there.
         """

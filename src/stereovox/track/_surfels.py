@@ -2,7 +2,7 @@
 """Kernels of tracking: patches of a depth image, surfels in a hash table, and how far patches lie off surfels.
 
 A surfel (9,) float32 is the mean of the patches that fell into one cubic cell: 0 weight, 1-3 position less the cell's
-corner in metres, 4-6 normal (its length tells how alike the normals are), 7 mean variance of the patches along their
+corner in metres, 4-6 normal (its length reports how alike the normals are), 7 mean variance of the patches along their
 normals, 8 number of patches.
 """
 

@@ -28,7 +28,7 @@ def stood_free(points, sigma, R, t, slope, nearest, deviations, tolerance, free)
 def seen_through(points, sigma, R, t, slope, depth, deviations, tolerance, step, found):
     """Count every `step`th point that a view looks through (found[0]) and that it sees as well (found[1]).
 
-    depth: (rows, columns) of the view, NaN where it has none; the rest as in `stood_free`.
+    depth: (rows, columns) of the view, NaN if it has none; the rest as in `stood_free`.
     """
     found[0] = found[1] = 0
     for i in range(0, points.shape[0], step):
@@ -45,7 +45,7 @@ def seen_through(points, sigma, R, t, slope, depth, deviations, tolerance, step,
 
 @cell
 def _place(points, i, R, t, slope, shape):
-    """Return row and column of a point in a view's grid, -1 where it is not in it, and its depth there."""
+    """Return row and column of a point in a view's grid, -1 if it is not in it, and its depth there."""
     x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
     a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
     b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]

@@ -24,7 +24,7 @@ ALIKE_BITS = 50
 class Kind(NamedTuple):
     """Which corners are followed.
 
-    block: pixels across of the square by which their strength is told. quality: their least strength by that of the
+    block: pixels across of the square by which their strength is reported. quality: their least strength by that of the
     strongest (Shi and Tomasi 1994). fewer: share of them that may be lost before new ones are looked for.
     """
 

@@ -63,7 +63,7 @@ class GuidedTracker:
         self._tracker.expect(frame)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
+        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
         return self._tracker.picture_use()
 
     def _begin(self, own: Transform | None) -> None:

@@ -24,7 +24,7 @@ SHARE = 0.02
 CLOCK_S = 0.003
 """Seconds between the clock of the IMU and the middle of the exposure."""
 BENDS = 0.25
-"""Share of the change from one reading to the next by which the rate may lie beside the straight line between."""
+"""Share of the change from one reading to the next by which the rate may lie next to the straight line between."""
 BIAS, SETTLED, WANDERS, NO_BIAS = 0.02, 0.002, 1e-3, 0.1
 """Bias of the angular rate in rad/s: its standard deviation at first and at least, how much it wanders in a second, and
 what is none any longer, but a wrong clock or unit."""
@@ -75,7 +75,7 @@ STILL = Turn(np.eye(3), np.zeros((3, 3)), 0.0, 0.0, 0.0)
 
 
 def integrate(imu: Imu, begin_ns: int, end_ns: int, bias: NDArray[np.float64]) -> Turn | None:
-    """Return how a camera turned by the gyroscope; None where its readings do not cover the time.
+    """Return how a camera turned by the gyroscope; None if its readings do not cover the time.
 
     bias: (3,) rad/s along the camera's axes, which is taken off.
     """
@@ -145,7 +145,7 @@ class Gyroscope:
         return f"turns of {self.used} images were expected by its gyroscope"
 
     def turn(self, begin_ns: int, end_ns: int) -> Turn | None:
-        """Return how the camera turned between two times; None where it is not known.
+        """Return how the camera turned between two times; None if it is not known.
 
         While the begin stays the same, only what is new is integrated.
         """
@@ -215,7 +215,7 @@ class Gyroscope:
 
 
 def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
-    """Return the IMU of a recording or camera that is tracked, and a line about it; None and "" where it has none."""
+    """Return the IMU of a recording or camera that is tracked, and a line about it; None and "" if it has none."""
     try:
         imu = imu_of(stream)
     except SourceError as error:
@@ -237,7 +237,7 @@ def up_by_force(imu: Imu, stamp_ns: int) -> UpEstimate | None:
     """Return which way is up at a time by the accelerometer.
 
     By the readings around it, turned by the gyroscope: at rest they feel what holds the camera up, and so they do on
-    the average, since no camera gets faster and faster. None where there are too few, their mean has not the length of
+    the average, since no camera gets faster and faster. None if there are too few, their mean has not the length of
     gravity, or their halves say different things.
     """
     readings = imu.between(stamp_ns - round(AROUND_S * 1e9), stamp_ns + round(AROUND_S * 1e9))
@@ -264,7 +264,7 @@ def up_by_force(imu: Imu, stamp_ns: int) -> UpEstimate | None:
 def _rest(
     seconds: NDArray[np.float64], force: NDArray[np.float64], rate: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return the mean force (3,) while the camera was at rest, nearest to second 0; None where it never was."""
+    """Return the mean force (3,) while the camera was at rest, nearest to second 0; None if it never was."""
     begins = np.arange(seconds[0], seconds[-1] - AT_REST_S + 1e-9, AT_REST_S / 4)
     for begin in sorted(begins, key=lambda begin: abs(begin + AT_REST_S / 2)):
         part = (seconds >= begin) & (seconds <= begin + AT_REST_S)

@@ -25,7 +25,7 @@ from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
 
 MAX_ARM_M = 10.0
-"""Farthest that a camera can be beside the depth camera."""
+"""Farthest that a camera can be next to the depth camera."""
 CELL, STEP = 4.0, 2
 """Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
 FOLLOWED = 0.2
@@ -46,7 +46,7 @@ On a plane they do not; on an edge, a corner is no fixed place.
 
 
 class Sighted(NamedTuple):
-    """An image beside a depth image; camera, T_sensor_camera: as those of `Photo`."""
+    """An image next to a depth image; camera, T_sensor_camera: as those of `Photo`."""
 
     sight: Sight
     camera: PinholeCamera
@@ -54,7 +54,7 @@ class Sighted(NamedTuple):
 
 
 class PhotoLandmarks(NamedTuple):
-    """Landmarks that were found in an image beside a depth image, and what they say of the depth camera's pose.
+    """Landmarks that were found in an image next to a depth image, and what they say of the depth camera's pose.
 
     lag: (6, 6) covariance of how the camera may have moved between both images, as that of `Fit`.
     """
@@ -68,7 +68,7 @@ class PhotoLandmarks(NamedTuple):
         return of_sensor(self.found.equations(reach), self.T_sensor_camera)
 
     def fit(self, expected: Transform, doubt: NDArray[np.float64]) -> Fit | None:
-        """Return the pose of the depth camera that most landmarks agree on; None where they agree on none.
+        """Return the pose of the depth camera that most landmarks agree on; None if they agree on none.
 
         expected, doubt: as those of `solve_stages`.
         """
@@ -112,11 +112,11 @@ class Photos:
         self.why = self.why or why or ""
 
     def picture_use(self) -> str:
-        """Return how many images are used, or how many could not be and why, in words; "" where there is none."""
+        """Return how many images are used, or how many could not be and why, in words; "" if there is none."""
         if self.left_out:
-            count = f"{self.left_out} of {self.offered} pictures beside depth images are not used"
+            count = f"{self.left_out} of {self.offered} pictures next to depth images are not used"
             return f"{count}; the first: {self.why}"
-        return f"{self.offered} pictures beside depth images are used" if self.offered else ""
+        return f"{self.offered} pictures next to depth images are used" if self.offered else ""
 
     def agree(self, T: Transform) -> None:
         """Take note that landmarks and depth say the same of T_map_sensor, which counts where the camera has moved."""
@@ -136,7 +136,7 @@ class Photos:
 
     def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> PhotoLandmarks | None:
         """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;
-        None where they are too few.
+        None if they are too few.
         """
         self._followed = None
         if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
@@ -185,7 +185,7 @@ class Photos:
 def sighted_or_why(
     photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
 ) -> tuple[Sighted | None, str | None]:
-    """Return what of an image is used, and why it cannot be: "" where it can, None where there is no image.
+    """Return what of an image is used, and why it cannot be: "" if it can, None if there is no image.
 
     sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
     """
@@ -196,13 +196,13 @@ def sighted_or_why(
 
 
 def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Sighted:
-    """Return an image with the depths that the depth image beside it measured; the rest as `sighted_or_why`.
+    """Return an image with the depths that the depth image next to it measured; the rest as `sighted_or_why`.
 
-    Raises FrameRefused where the image cannot be read, or is not what its camera says.
+    Raises FrameRefused if the image cannot be read, or is not what its camera says.
     """
     camera, T_sensor_camera = _camera_of(photo)
     pixels = photo.pixels() if callable(photo.pixels) else photo.pixels
-    picture = grey(pixels, (camera.width, camera.height), "the image beside the depth image")
+    picture = grey(pixels, (camera.width, camera.height), "the image next to the depth image")
     cell_px, depths = inverse_depths(image, camera, T_sensor_camera, sigma_of, rows_per_metre)
     known = np.where(depths > 0, np.uint8(255), np.uint8(0)).repeat(cell_px, axis=0).repeat(cell_px, axis=1)
     mask = np.ascontiguousarray(known[: camera.height, : camera.width])
@@ -212,16 +212,16 @@ def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows
 
 
 def _camera_of(photo: Photo) -> tuple[PinholeCamera, Transform]:
-    """Return the camera of an image beside a depth image and its T_sensor_camera; raises FrameRefused `bad_form`."""
+    """Return the camera of an image next to a depth image and its T_sensor_camera; raises FrameRefused `bad_form`."""
     if not isinstance(photo, Photo) or not isinstance(photo.camera, PinholeCamera):
         given = getattr(photo, "camera", photo)
         raise FrameRefused("bad_form", f"photo: {type(given).__name__} is no camera; give sv.Photo(pixels, camera)")
     T = matrix_of(photo.T_sensor_camera)
     if not rigidity_error(T) < RIGID:
-        raise FrameRefused("bad_form", "T_sensor_camera of the image beside the depth image is no rigid motion")
+        raise FrameRefused("bad_form", "T_sensor_camera of the image next to the depth image is no rigid motion")
     arm = float(np.linalg.norm(T[:3, 3]))
     if arm > MAX_ARM_M:
-        raise FrameRefused("bad_form", f"T_sensor_camera of the image beside the depth image: {arm:g} m; give metres")
+        raise FrameRefused("bad_form", f"T_sensor_camera of the image next to the depth image: {arm:g} m; give metres")
     return photo.camera, orthonormalise(T)
 
 
@@ -249,7 +249,7 @@ def inverse_depths(
 
     sigma_of: as that of `Photos.see`.
 
-    (h, w) float32, the mean of each cell and those around it; 0 where there is none, and beside edges.
+    (h, w) float32, the mean of each cell and those around it; 0 if there is none, and next to edges.
     """
     cell_px = max(1, math.ceil(CELL * max(1.0, camera.focal_px / image.camera.focal_px)))
     shape = math.ceil(camera.height / cell_px), math.ceil(camera.width / cell_px)

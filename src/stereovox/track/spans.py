@@ -63,7 +63,7 @@ class LostSpans:
         return sum(map(len, self.spans))
 
     def add(self, stamp_ns: int, why: str) -> None:
-        """Take note of the next frame; `why` is empty where it was tracked."""
+        """Take note of the next frame; `why` is empty if it was tracked."""
         number = self._number + self.frames
         self.frames += 1
         if not why:

@@ -122,7 +122,7 @@ class Surfaces:
         self._photos, self._free = Photos(), 0.0
 
     def see(self, frame: AnyFrame) -> Seen:
-        """Return what of a frame is used; raises FrameRefused, also where too few patches lie on surfaces."""
+        """Return what of a frame is used; raises FrameRefused, also if too few patches lie on surfaces."""
         image = self._depth.image(self._depth.matched(replace(frame, T_world_sensor=np.eye(4))))
         sigma_of = self._sigma[image.camera]
         patches = patches_of(image, sigma_of, ROWS_PER_METRE)
@@ -141,7 +141,7 @@ class Surfaces:
         return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
+        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
         return self._photos.picture_use()
 
     def forget(self) -> None:
@@ -167,7 +167,7 @@ class Surfaces:
         doubt: NDArray[np.float64],
         quietest: float,
     ) -> Fit:
-        """Return how patches, and landmarks beside them, fit."""
+        """Return how patches, and landmarks next to them, fit."""
         levels = self._map.levels(patches, quietest)
         stages = [Stage(level, CONVERGED * level.size) for level in levels]
         T, covariance = solve_stages(stages, expected, doubt)
@@ -261,7 +261,7 @@ class Surfaces:
         return kept
 
     def doubted(self, seen: Seen, fit: Fit) -> str:
-        """Return what speaks against the pose of an image that follows, "" where nothing does.
+        """Return what speaks against the pose of an image that follows, "" if nothing does.
 
         Where much of the view is elsewhere than it was, something moves, or the pose is wrong: then older surfels must
         hold the same pose.
@@ -282,7 +282,7 @@ class Surfaces:
         return "" if held or stir <= DISTURBED else f"{stir:.0%} of the view moves, and the rest does not hold the pose"
 
     def ambiguous(self, seen: Seen, T: Transform, known: float) -> str:
-        """Return why an image may be from another place that is like that at T_map_camera, "" where it is not.
+        """Return why an image may be from another place that is like that at T_map_camera, "" if it is not.
 
         Any corner of a room lies on any other: so much must be known of what is not part of its largest planes.
         """
@@ -295,7 +295,7 @@ class Surfaces:
         return f"{level.known:.0%} of what is not on its largest planes is known, {known:.0%} is needed" if few else ""
 
     def contradicted(self, seen: Seen, T: Transform) -> str:
-        """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""
+        """Return what speaks against an image having been taken from T_map_camera, "" if nothing does."""
         patches = seen.patches
         share, number = contradiction(view_of(patches.points, patches.sigma, T), self._views)
         if number < MIN_PATCHES:

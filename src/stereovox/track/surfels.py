@@ -23,7 +23,7 @@ SLACK = (0.05, 0.015, 0.005, 0.002)
 EVERY = (4, 4, 2, 1)
 """Of so many patches one is used, at each size."""
 SAMPLED = 4
-"""Of so many patches one tells how large the residuals are."""
+"""Of so many patches one reports how large the residuals are."""
 REACH = 3.0
 """Standard deviations at which a patch begins to count little."""
 CONVERGED = 0.01
@@ -122,7 +122,7 @@ class Surfels:
         self.number -= drop(self._keys, self._surfels, float(self.size), np.asarray(centre, float), float(radius))
 
     def nearest(self, seen: Patches, T: Transform) -> NDArray[np.int64]:
-        """Return the number (N,) of the surfel of each patch seen from T_map_camera, -1 where there is none."""
+        """Return the number (N,) of the surfel of each patch seen from T_map_camera, -1 if there is none."""
         slots = np.empty(len(seen.points), np.int64)
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
         nearest(self._keys, self._surfels, self.size, seen.points, seen.normals, R, t, slots)

@@ -88,7 +88,7 @@ class Evidence(Protocol[Seen]):
     limits: Limits
 
     def see(self, frame: AnyFrame, /) -> Seen:
-        """Return what of a frame is used; raises FrameRefused where it cannot be.
+        """Return what of a frame is used; raises FrameRefused if it cannot be.
 
         It changes nothing that the other methods use: it may run in another thread, for frames that never come.
         """
@@ -99,7 +99,7 @@ class Evidence(Protocol[Seen]):
         ...
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
+        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
         ...
 
     def forget(self) -> None:
@@ -123,18 +123,18 @@ class Evidence(Protocol[Seen]):
         ...
 
     def doubted(self, seen: Seen, fit: Fit, /) -> str:
-        """Return what speaks against the pose of an image that follows, "" where nothing does."""
+        """Return what speaks against the pose of an image that follows, "" if nothing does."""
         ...
 
     def ambiguous(self, seen: Seen, T: Transform, known: float, /) -> str:
-        """Return why an image may be from another place that is like that at T_map_camera, "" where it is not.
+        """Return why an image may be from another place that is like that at T_map_camera, "" if it is not.
 
         known: share that must be known of what tells places apart.
         """
         ...
 
     def contradicted(self, seen: Seen, T: Transform, /) -> str:
-        """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""
+        """Return what speaks against an image having been taken from T_map_camera, "" if nothing does."""
         ...
 
 
@@ -147,7 +147,7 @@ class Tracked:
             last that was followed.
         covariance: (6, 6) float64 of its place on what was seen so far: rotation about the camera in radians, then
             position in metres, along the world's axes; infinite where it is lost. Drift since the start is not in it.
-        lost: Why the pose is not known, in words; "" where it is.
+        lost: Why the pose is not known, in words; "" if it is.
         begins: Whether a map is begun with this image: it is lost until the next one fits it.
         believed: Whether the pose is that of a given motion alone, since nothing known was in view.
     """
@@ -175,13 +175,13 @@ class Tracker:
     after some images that agree. Poses that frames bring are not used. All frames come from one camera.
 
     With an IMU, images are expected where its gyroscope turns the camera, once its turns have been found to be those of
-    the images; where they are not, it is left out. Its accelerometer says which way is up.
+    the images; if they are not, it is left out. Its accelerometer says which way is up.
 
     Args:
         profile: Profile name, TOML file or `Config`: depth, noise and range are prepared as for a map.
         start: (4, 4) T_world_sensor of the image that the map begins with, the first that the next one fits; without
             it the camera looks along x, level, z up.
-        imu: An IMU beside the camera: `ImuReadings` of a recording, or a `LiveImu` that is fed before each frame.
+        imu: An IMU next to the camera: `ImuReadings` of a recording, or a `LiveImu` that is fed before each frame.
             `start` is tilted to what its accelerometer says is up, where they differ by more than that may be off: 1
             degree if the camera stood still around that image, else 5.
         **overrides: Settings that replace those of the profile.
@@ -237,7 +237,7 @@ class Tracker:
                 where all in view is new; then a frame is lost only where what it sees contradicts what is known.
 
         Returns:
-            Its pose, or why it is lost: also where the image itself cannot be used. The first image counts once the
+            Its pose, or why it is lost: also if the image itself cannot be used. The first image counts once the
             next is tracked on it.
 
         Raises:
@@ -278,7 +278,7 @@ class Tracker:
             self._see.begin(frame)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
+        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
         return self._evidence.picture_use() if self._evidence else ""
 
     def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
@@ -395,7 +395,7 @@ class Tracker:
         return (stamp_ns - self._stamps[-1]) / inlier_share if inlier_share else 1.0
 
     def _usual(self) -> float:
-        """Return how far apart images usually are, in nanoseconds; 0 where that is not known."""
+        """Return how far apart images usually are, in nanoseconds; 0 if that is not known."""
         apart = np.diff(self._stamps)
         return float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
 
@@ -453,7 +453,7 @@ class Tracker:
     def _refused(
         self, evidence: Evidence[Seen], seen: Seen, fit: Fit, stamp_ns: int, last: Transform, reach: float
     ) -> str:
-        """Return why an image is not believed to be where it fits, "" where it is; last, reach: as of `_turned`."""
+        """Return why an image is not believed to be where it fits, "" if it is; last, reach: as of `_turned`."""
         demand, T = self._demand(fit, stamp_ns), fit.T_map_camera
         why = _doubt(fit, demand) or _open(fit, evidence.limits.unsure)
         if not why and far_apart(last, T, np.inf, reach):
@@ -505,7 +505,7 @@ def _seen(evidence: Evidence[Seen], frame: AnyFrame) -> Seen:
 
 
 def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand) -> tuple[Fit, str]:
-    """Return how an image fits near a guess, and why it does not, "" where it does."""
+    """Return how an image fits near a guess, and why it does not, "" if it does."""
     fit = evidence.fit(seen, *guess)
     why = _doubt(fit, demand) or _open(fit, evidence.limits.adrift) or _leap(fit, guess)
     why = why or evidence.doubted(seen, fit)
@@ -521,7 +521,7 @@ def _leap(fit: Fit, guess: Guess) -> str:
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:
-    """Return why a fit is not believed, "" where it is."""
+    """Return why a fit is not believed, "" if it is."""
     if fit.known < demand.known:
         return f"{fit.known:.0%} of what it sees is known, {demand.known:.0%} is needed"
     if fit.inlier_share < demand.inlier_share:
@@ -530,7 +530,7 @@ def _doubt(fit: Fit, demand: Demand) -> str:
 
 
 def _open(fit: Fit, limit: tuple[float, float]) -> str:
-    """Return by how much a pose is open, where it is by more than a limit in radians and metres; "" where it is not."""
+    """Return by how much a pose is open, where it is by more than a limit in radians and metres; "" if it is not."""
     turn, shift = deviations(fit.covariance)
     if turn > limit[0] or shift > limit[1]:
         return f"what it sees leaves the pose open by {shift:.3f} m and {np.degrees(turn):.1f} degrees"

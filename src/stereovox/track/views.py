@@ -30,9 +30,9 @@ TURNED_M = 2.0
 
 
 class View(NamedTuple):
-    """What one image saw. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN where there is none.
+    """What one image saw. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN if there is none.
 
-    nearest: the least of each place of the grid and those around it, infinity where there is none. points: (N, 3)
+    nearest: the least of each place of the grid and those around it, infinity if there is none. points: (N, 3)
     float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half
     height of the grid at one metre.
     """

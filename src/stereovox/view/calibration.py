@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of calibrations: walls before and after a correction, noise by distance and beside theory."""
+"""Pictures of calibrations: walls before and after a correction, noise by distance and next to theory."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def facts(grid: OccupancyGrid) -> list[str]:
 
 
 def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
-    """Return lowest and highest (2,) x, y of known cells and track, with a margin; None where there are none."""
+    """Return lowest and highest (2,) x, y of known cells and track, with a margin; None if missing."""
     corners = se2.transform(grid.origin, grid.known_corners * grid.resolution)
     if track is not None and np.size(track):
         corners = np.concatenate([corners, np.asarray(track, float)[:, :2]])

@@ -45,7 +45,7 @@ def binary_png(laid: AlignedGrids) -> bytes:
 
 
 def classes(laid: AlignedGrids) -> NDArray[np.uint8]:
-    """Return for each cell, (rows, columns) uint8, its `Difference`, or where there is none the common state."""
+    """Return for each cell, (rows, columns) uint8, its `Difference`, or if there is none the common state."""
     found = differences(laid)
     same = np.full(len(State), BOTH_UNKNOWN, np.uint8)
     same[State.FREE], same[State.OCCUPIED] = BOTH_FREE, BOTH_OCCUPIED

@@ -40,7 +40,7 @@ def loops_picture(closure: LoopClosure, after: VoxelMap, file: str | Path, befor
     """Draw what loop closure found and did.
 
     From above: the camera's way before (grey) and after (blue), closed loops (green) and refused ones (red, dashed)
-    between their places, with the reasons. Beside it the map where the poses were most off, before and after.
+    between their places, with the reasons. Next to it the map where the poses were most off, before and after.
 
     Args:
         closure: From `close_loops`.

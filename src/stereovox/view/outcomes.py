@@ -62,7 +62,7 @@ def mixed(
     size: tuple[int, ...],
     classes: Mapping[str, tuple[str, list[Outcome]]],
 ) -> NDArray[np.float64]:
-    """Return an image (rows, columns, 3): each pixel has the mean colour of its cells, white where there are none.
+    """Return an image (rows, columns, 3): each pixel has the mean colour of its cells, white if there are none.
 
     places: (M, 2) column and row of each cell; cells without a class are not drawn.
     """

@@ -34,7 +34,7 @@ def picture(
     """Write a PNG of a map: top view, three oblique views coloured by height, and a slice with all four states.
 
     trajectory: camera positions (N, 3) in metres, drawn as a line; by default the path that the map remembers, and none
-    where it is empty. up: the map's axis that points up (`z`, `-y`, ...). A ceiling is hidden. An empty map gives a
+    if it is empty. up: the map's axis that points up (`z`, `-y`, ...). A ceiling is hidden. An empty map gives a
     picture that says so. Raises StereovoxError for an invalid `up`, a name that does not end in .png or a file that
     cannot be written.
     """
@@ -109,7 +109,7 @@ def _page(drawn: Drawn) -> Any:
 
 
 def height_bar(figure: Any, axis: Any, mappable: Any, drawn: Drawn) -> None:
-    """Add the colour bar of heights beside a panel."""
+    """Add the colour bar of heights next to a panel."""
     bar = figure.colorbar(mappable, ax=axis, pad=0.01, fraction=0.03, aspect=25)
     bar.set_label(f"height {drawn.names[2]} [m]", color=GREY)
     bar.ax.tick_params(colors=GREY)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of trajectories: from above, height, errors along the way and by length, and where there is no pose."""
+"""Pictures of trajectories: from above, height, errors along the way and by length, and if there is no pose."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Spans = list[tuple[int, int]]
 
 
 def trajectory_picture(score: TrajectoryScore, file: str | Path) -> None:
-    """Draw an estimated trajectory beside the true one, and its errors.
+    """Draw an estimated trajectory next to the true one, and its errors.
 
     From above, along the axis of the truth's frame along which it spreads least; height; position and rotation errors
     along the way; errors of motions by length (KITTI's rule). Where the estimate has no pose for longer than three of
@@ -166,7 +166,7 @@ def _from_above(axis: Any, flat: Sequence[int]) -> None:
 
 
 def _in_pieces(axis: Any, points: NDArray[np.float64], lost: Spans, label: str = "", **style: Any) -> None:
-    """Draw a line through points (N, 2) that is interrupted where there are none between."""
+    """Draw a line through points (N, 2) that is interrupted if there are none between."""
     broken = np.insert(points, [after for _, after in lost], np.nan, axis=0)
     axis.plot(*broken.T, label=label or None, **style)
 

@@ -115,7 +115,7 @@ def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
 
 
 def _add_lines(server: ViserServer, name: str, segments: NDArray[np.float64], colour: str) -> None:
-    """Add line segments (N, 2, 3), or remove them where there are none."""
+    """Add line segments (N, 2, 3), or remove them if there are none."""
     if len(segments):
         server.scene.add_line_segments(name, segments, rgb(colour), thickness=3, thickness_units="screen")
     else:

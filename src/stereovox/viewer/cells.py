@@ -39,7 +39,7 @@ LABELS = {
     State.OCCUPIED: "occupied",
     State.TENTATIVE: "tentative",
     State.FREE: "free",
-    State.UNKNOWN: "unknown beside free",
+    State.UNKNOWN: "unknown next to free",
 }
 COLOUR_LABELS = {HEIGHT: "height of occupied cells {} [m]", PROBABILITY: "probability", AGE: "seconds since last seen"}
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
@@ -106,7 +106,7 @@ class Cells:
 
     kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down of what colours occupied
     cells. below: slider in metres along `up`; cells above it are hidden. solid: occupied cells (N, 3) that are
-    shown now. scale: mappable for a colour bar, None where no cell is occupied. most: cells of one kind
+    shown now. scale: mappable for a colour bar, None if no cell is occupied. most: cells of one kind
     that are in the scene at once, about.
     """
 

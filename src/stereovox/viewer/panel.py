@@ -66,7 +66,7 @@ def colour_bar(scale: Any, label: str, limits: tuple[float, float] | None = None
 def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
     """Return a picture (H, W, 3) of the log-odds along the optical axis (Chien 2020, Fig 4.6).
 
-    Raises StereovoxError where the map does not know its camera.
+    Raises StereovoxError if the map does not know its camera.
     """
     figure = _figure(2.9)
     axis = figure.add_subplot()

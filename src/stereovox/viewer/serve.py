@@ -59,7 +59,7 @@ def is_loopback(number: str) -> bool:
 def find_address(host: str, port: int) -> Address:
     """Return the address to listen on: the first one of `host`, resolved only once, since the answer may change.
 
-    Raises StereovoxError where no page can be served there; viser would use another port or wait for ever.
+    Raises StereovoxError if no page can be served there; viser would use another port or wait for ever.
     """
     if not 0 <= port <= 65535:
         raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535")
@@ -124,7 +124,7 @@ class Guard:
         self._host, self._token = host.lower(), token
 
     def refusal(self, path: str, headers: Headers, port: int) -> str | None:
-        """Return in one line why a request is refused, None where it is admitted. path: with its query."""
+        """Return in one line why a request is refused, None if it is admitted. path: with its query."""
         named, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(named) != 1:
             return "one Host header is needed"
@@ -194,7 +194,7 @@ def _cookie_name(port: int) -> str:
 def serve(name: str, address: Address, guard: Guard) -> ViserServer:
     """Start a server whose every page, file and websocket is behind `guard`.
 
-    Raises MissingExtra without viser, StereovoxError where the port has been taken meanwhile or this version of viser
+    Raises MissingExtra without viser, StereovoxError if the port has been taken meanwhile or this version of viser
     does not ask the guard.
     """
     try:

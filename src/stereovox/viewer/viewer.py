@@ -47,7 +47,7 @@ WIDE_ENOUGH = 0.8
 BEFORE = (3.0, 3.0, 3.0)
 """Where the camera of a page stands before it learns of the initial viewpoint."""
 NARROW_PX = 480
-"""Narrower maps have no room for the controls beside them."""
+"""Narrower maps have no room for the controls next to them."""
 
 
 class Viewer:
@@ -210,7 +210,7 @@ def open_viewer(
 def _dress(server: Any) -> None:
     server.request_share_url = lambda *_, **__: None  # else any page in the browser could ask it to publish the map
     server.scene.configure_environment_map(hdri=None)  # its reflections make all heights look alike
-    server.gui.main_panel.dock_right()  # beside the map, not over it
+    server.gui.main_panel.dock_right()  # next to the map, not over it
     server.gui.add_html(PEEK)
     _theme(server, False)
 

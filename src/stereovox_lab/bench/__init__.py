@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmarks: stereovox beside other libraries."""
+"""Benchmarks: stereovox next to other libraries."""

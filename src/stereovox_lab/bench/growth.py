@@ -26,7 +26,7 @@ CELLS = (10**4, 10**5, 10**6, 10**7, 10**8)
 BLOCK_CELLS = 512
 BYTES_A_CELL = 7
 """Needed while a map grows, at most: it moves to a place half as large again, two bytes a cell, and for a moment holds
-both, beside the evidence that is added."""
+both, next to the evidence that is added."""
 ROUNDS = 3
 SEED = 0
 FRAMES = 6000
@@ -150,7 +150,7 @@ def size_table(result: dict[str, Any]) -> Table:
 
 @dataclass
 class _Flight:
-    """One map along the way, beside one that begins near the way's end and sees the same frames."""
+    """One map along the way, next to one that begins near the way's end and sees the same frames."""
 
     settings: dict[str, Any]
     mapper: Mapper = field(init=False)

@@ -50,7 +50,7 @@ def cores() -> int:
 
 
 def memory_left() -> int | None:
-    """Return the bytes of memory that are free or can be freed; None where the system does not report it."""
+    """Return the bytes of memory that are free or can be freed; None if the system does not report it."""
     return _meminfo("MemAvailable")
 
 

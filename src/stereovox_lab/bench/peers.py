@@ -112,7 +112,7 @@ class ImagePeer(Protocol):
         """Insert a depth image. This, and only this, is timed.
 
         Args:
-            depth_m: (height, width) float32 metres, 0 where there is no value.
+            depth_m: (height, width) float32 metres, 0 if there is no value.
             camera: Camera of the image.
             T_world_camera: (4, 4) pose of the optical frame.
         """
@@ -140,7 +140,7 @@ class CellsPeer(Protocol):
     """Peer whose cells can be read, as `stereovox benchmark` needs it.
 
     occupied_above: probability above which a cell is occupied, below which it is free. about: the library's settings.
-    package: the distribution whose version is told.
+    package: the distribution whose version is reported.
     """
 
     occupied_above: float

@@ -88,7 +88,7 @@ def _title(result: dict[str, Any]) -> str:
 
 
 def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None, whole: bool) -> tuple[str, ...]:
-    """Return the cells of a line; `ratio` is None where there are no peers, and so no column for it."""
+    """Return the cells of a line; `ratio` is None if there are no peers, and so no column for it."""
     faster = () if ratio is None else (_faster(ratio.get(row["library"])),)
     add = (f"{row['add_ms_median']:.2f}" if "add_ms_median" in row else "",) if whole else ()
     return (

@@ -114,7 +114,7 @@ def bench(
     into a map that is thrown away; its points are made before. What a peer's Python binding does with the points is
     part of it: a Python user pays that, a C++ program would not.
 
-    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how
+    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` reports how
     many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, integrate_ms_p99,

@@ -23,7 +23,7 @@ from stereovox_lab.benchmark.data import Task, raw
 
 OURS = "stereovox"
 USUAL = (OURS, "octomap", "pyoctomap", "wavemap")
-"""Libraries that are compared where none is named, as far as they are installed."""
+"""Libraries that are compared if none is named, as far as they are installed."""
 HAIR = 1e-4
 """A cell of a library with one threshold is free below it, less so much."""
 WIDEST = 30.0

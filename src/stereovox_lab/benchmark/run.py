@@ -89,7 +89,7 @@ def judged(library: Library, task: Task, tell: Progress = silent) -> dict[str, A
 
 
 def figures_of(scores: Scores) -> dict[str, float | None]:
-    """Return the figures of a table; None where there is nothing to divide by.
+    """Return the figures of a table; None if there is nothing to divide by.
 
     wrongly_free, wrongly_free_alone: of the surface cells that the map knows, the shares called free, and free with
     nothing tentative or occupied within one cell. thin_lost: of the surface cells of lines (`Thickness`), the share

@@ -52,7 +52,7 @@ def time_to_clear(
     through the cell. before: (N,) states before the first frame, by default unknown. The clock starts at the first
     frame that sees the cell free while the map, before that frame, calls it occupied, and stops at the first frame
     after which its state is one of `clear`; frames that do not see the cell count as well. Give only cells that stay
-    free from then on. Raises StereovoxError where the arrays do not fit together.
+    free from then on. Raises StereovoxError if the arrays do not fit together.
     """
     after, seen = np.asarray(states), np.asarray(seen_free, bool)
     if after.ndim != 2 or seen.shape != after.shape:
@@ -66,7 +66,7 @@ def time_to_clear(
 
 
 def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return for each column of (F, N) the first row that is true, inf where none is."""
+    """Return for each column of (F, N) the first row that is true, inf if none is."""
     if not len(flags):
         return np.full(flags.shape[1], np.inf)
     return np.where(flags.any(axis=0), flags.argmax(axis=0), np.inf)
@@ -82,7 +82,7 @@ class Ghosts:
     after_leaving: frames, from the first that does not show the person, until no cell that was seen is a ghost; inf:
         never.
     pole_lost: of the layers of cells in which the pole was found in the first second, the share in which, later, it has
-        no occupied cell; mean over all frames. 1 where it was not found at all.
+        no occupied cell; mean over all frames. 1 if it was not found at all.
     pole_free: the same for single cells that had been occupied and are free; the pole may only have grazed them.
     static_lost: share of the wall's and floor's cells, occupied before the person came, that were not so at the end.
     """
@@ -141,7 +141,7 @@ def ghosts(source: PasserBy, frames: list[Frame] | None = None, **settings: Any)
 
 
 def passed_cells(side: float) -> NDArray[np.int32]:
-    """Return the indices (N, 3) of all cells with sides `side` where the person passes, or its noise may be."""
+    """Return the indices (N, 3) of all cells with sides `side` if the person passes, or its noise may be."""
     deep, half = WIDE / 2 + NOISE, WALK_FROM + WIDE
     low, high = (WALK_X - deep, -half, 2 * side), (WALK_X + deep, half, TALL + NOISE)  # the floor stays
     axes = [np.arange(np.floor(a / side), np.ceil(b / side)) for a, b in zip(low, high, strict=True)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A person crosses the view of a camera at rest and leaves; a thin pole stands beside the path."""
+"""A person crosses the view of a camera at rest and leaves; a thin pole stands next to the path."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class PasserBy(DepthSource):
 
     @lru_cache(maxsize=1)  # noqa: B019 - one image, asked for again at once
     def true_depth(self, i: int) -> NDArray[np.float32]:
-        """Return the exact depth (height, width) in metres of frame `i`, inf where nothing is."""
+        """Return the exact depth (height, width) in metres of frame `i`, inf if nothing is."""
         return self._cast(self.person(i), pole=True)
 
     def shows_person(self, i: int) -> bool:

@@ -27,7 +27,7 @@ def nearest_surfaces(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the true range of the nearest and of the farthest surface in each cell (azimuths, polars), metres.
 
-    By rays * rays rays from the body's origin, even in both angles. Infinite where nothing is.
+    By rays * rays rays from the body's origin, even in both angles. Infinite if nothing is.
     """
     offsets = ((np.arange(rays) + 0.5) / rays - 0.5) * layout.step
     theta = (layout.polar()[:, None] + offsets).reshape(1, -1)
@@ -56,7 +56,7 @@ def seen_cells(
 def range_sigma(
     pair: StereoPair, layout: SphereLayout, range_m: NDArray[np.floating], disparity_sigma: float
 ) -> NDArray[np.float64]:
-    """Return the standard deviation (azimuths, polars) in metres of ranges that a pair measures; NaN where it cannot.
+    """Return the standard deviation (azimuths, polars) in metres of ranges that a pair measures; NaN if it cannot.
 
     From Valenti 2018, Eq 4.2 and 4.7, along the ray from the pair's left eye. disparity_sigma: pixels.
     """

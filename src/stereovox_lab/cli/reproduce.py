@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reproduce the experiments of a paper: one report with its figures beside ours.
+"""Reproduce the experiments of a paper: one report with its figures next to ours.
 
 All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.

@@ -98,7 +98,7 @@ def explore(
 def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what all flights in one scene come to; medians are over flights.
 
-    `seconds_to_share`: median seconds until a flight knew that share of the air, None where fewer than half came to it.
+    `seconds_to_share`: median seconds until a flight knew that share of the air, None if fewer than half came to it.
     `left`: the frontiers that are left in all of them together, by why they were not gone to.
     """
     mine = [row for row in rows if row["scene"] == scene]

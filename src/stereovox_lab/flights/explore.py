@@ -2,7 +2,7 @@
 """Missions of a simulated quadrotor that nobody steers: find the middle of a room and look round, and explore a hall.
 
 Each goal is reached by a way that is known to be free, and the vehicle looks where it flies; while it flies, the way
-ahead is checked against the newest map, and it stops and plans again where that is not free any more.
+ahead is checked against the newest map, and it stops and plans again if that is not free any more.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class Explored:
         path: (3,) metres every second, where it flew.
         room_m: Horizontal metres about the place where it ended that touch nothing, `half_height` above and below.
         most_room_m: The most of that there is anywhere in the scene's air at its height.
-        left: How many frontiers are left, by why it does not go there; empty where it did not end by itself.
+        left: How many frontiers are left, by why it does not go there; empty if it did not end by itself.
     """
 
     seed: int

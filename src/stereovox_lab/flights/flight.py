@@ -108,7 +108,7 @@ class World:
         self._low, self._high = corners.min(axis=0), corners.max(axis=0)
 
     def start(self, random: np.random.Generator) -> NDArray[np.float64]:
-        """Return a place (3,) with room about it; raises SourceError where a scene has none."""
+        """Return a place (3,) with room about it; raises SourceError if a scene has none."""
         for _ in range(10_000):
             place = random.uniform(self._low, self._high)
             place[2] = random.uniform(*HEIGHTS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reproductions: experiments of papers on simulated recordings, with the paper's figures beside ours."""
+"""Reproductions: experiments of papers on simulated recordings, with the paper's figures next to ours."""
 
 from __future__ import annotations
 

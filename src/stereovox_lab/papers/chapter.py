@@ -16,7 +16,7 @@ YES, NO, UNJUDGED = "\u2713 yes", "\u2717 no", "? cannot be judged"
 class Claim:
     """One row of "does it hold?".
 
-    holds: None where nothing is claimed and the number is for comparison, or where the claim cannot be judged here:
+    holds: None if nothing is claimed and the number is for comparison, or where the claim cannot be judged here:
     `unjudged` then says why not.
     """
 

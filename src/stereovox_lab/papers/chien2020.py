@@ -27,7 +27,7 @@ TITLE = "Reproduction of Chien 2020"
 LEAD = (
     "A 3-D occupancy grid from a RealSense D435 and T265 on a drone (MSc thesis, Penn State 2020): its experiments "
     "with simulated cameras in simulated scenes, whose truth is known. The thesis's recordings were not published and "
-    "its pictures are not at hand; its numbers and words stand beside ours. Claims that are expected not to hold: two "
+    "its pictures are not at hand; its numbers and words stand next to ours. Claims that are expected not to hold: two "
     "cells wide at any setting (chapter 2), solid walls at 0.2 m, and cells of 0.05 m through a drifting tracker "
     "(chapter 3)."
 )

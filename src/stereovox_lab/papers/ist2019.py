@@ -27,7 +27,7 @@ LEAD = (
     "A Pioneer robot with a Kinect maps a floor in two dimensions (report, Instituto Superior T\u00e9cnico, 2019): a "
     "reference map by SLAM from its lidar, localisation in that map, then an occupancy grid from depth images. The "
     "report's bags were not published; ours are recorded in simulated floors of the same kind, whose truth is known: "
-    "its figures stand beside ours and were not measured on the same data."
+    "its figures stand next to ours and were not measured on the same data."
 )
 OWN = (
     "The same chain on a recording of your own: a reference map by SLAM from its lidar, localisation in that map, then "

@@ -89,7 +89,7 @@ class Steps:
 
 
 def output_files(out: Path) -> dict[str, Path]:
-    """Return the files to be written; raises StereovoxError now, not after minutes, where they cannot be."""
+    """Return the files to be written; raises StereovoxError now, not after minutes, if they cannot be."""
     out_folder(out)
     files = {"report": out / "report.html", "numbers": out / "numbers.json"}
     for path in files.values():
@@ -112,7 +112,7 @@ def write_result(
     """Write the page and the numbers of all chapters; return the result of the command.
 
     lead: what the page begins with; heads: of the four columns of claims.
-    Raises StereovoxError where a file cannot be written.
+    Raises StereovoxError if a file cannot be written.
     """
     claims = [claim for chapter in found for claim in chapter.claims]
     result = {

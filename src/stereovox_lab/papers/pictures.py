@@ -18,7 +18,7 @@ THESIS, OURS, SECOND = "#b9c0cb", "#23618c", "#d1603d"
 
 
 def cut(solid: Solid, y: float) -> NDArray[np.float64]:
-    """Return the corners (N, 2) in x and z of a convex solid's section at this height, in order; empty where none."""
+    """Return the corners (N, 2) in x and z of a convex solid's section at this height, in order; empty if none."""
     edges = np.concatenate([solid.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
     a, b = edges[:, 0], edges[:, 1]
     crosses = (a[:, 1] < y) != (b[:, 1] < y)

@@ -37,7 +37,7 @@ LEAD = (
 )
 HEADS = ("claim", "wanted, or thesis", "ours", "holds?")
 TABLE = Setting(0.5, 20.0)
-"""Shown frame by frame, and beside Table 8.1."""
+"""Shown frame by frame, and next to Table 8.1."""
 TIMED = Setting(0.2, 20.0)
 
 

@@ -64,7 +64,7 @@ def test_a_step_of_which_they_say_different_things_is_held_softly():
 
 
 def test_the_joint_motion_is_the_weighted_mean():
-    """By the textbook, where there is no turn: precision adds up, and each counts by its own."""
+    """By the textbook, if there is no turn: precision adds up, and each counts by its own."""
     config = load_config(**{"loops.odometry_drift": 0.1}).loops
     motion, other = np.eye(4), np.eye(4)
     motion[:3, 3], other[:3, 3] = [1, 0, 0], [1.1, 0.05, 0]

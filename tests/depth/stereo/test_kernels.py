@@ -181,7 +181,7 @@ def test_halved_images_are_means_and_double_back():
 
 
 def slow_doubled(half, shape):
-    """Return the bilinear disparity of full pixels, whose centres lie a quarter beside those of halved ones."""
+    """Return the bilinear disparity of full pixels, whose centres lie a quarter next to those of halved ones."""
     full = np.empty(shape)
     for v, u in np.ndindex(shape):
         y, x = (np.clip((i + 0.5) / 2 - 0.5, 0, n - 1) for i, n in zip((v, u), half.shape, strict=True))

@@ -148,7 +148,7 @@ def test_ctrl_c_before_anything_is_done_leaves_nothing(recording, tmp_path, caps
 
 
 def test_the_toy_of_the_page_runs(recording, tmp_path):
-    """As the page says: saved beside where the command is run, in a process of its own."""
+    """As the page says: saved next to where the command is run, in a process of its own."""
     example = next(code for code in re.findall(r"```python\n(.*?)```", SPEED.read_text(), re.DOTALL) if "Toy" in code)
     (tmp_path / "toy_peer.py").write_text(example)
     words = ["bench", str(recording), "--peers", "toy_peer:Toy", "--voxel-size", "0.1", "--json"]

@@ -85,7 +85,7 @@ AROUND = {
     "lambda_short": {"model": "beam", "z_short": 0.4},
     "update_min_a": {"update_min_d": 0.5},
 }
-"""What a setting needs beside it to matter."""
+"""What a setting needs next to it to matter."""
 
 
 def test_no_setting_is_missing_in_the_table():

@@ -196,7 +196,7 @@ def test_evidence_that_names_a_block_twice_does_no_harm():
 
 
 def free_map():
-    """A map of one block at the floor, one beside it that is not."""
+    """A map of one block at the floor, one next to it that is not."""
     voxel_map = VoxelMap(load_config(voxel_size=0.1))
     steps = np.full((1, 512), -30000, np.int16)
     steps[0, 9] = 0

@@ -201,7 +201,7 @@ def test_rays_on_faces_and_corners():
     assert hit([0, 0.25, 0.25], [1, 0, 0], 4.0) == (4.0, [8, 0, 0])  # just as far as allowed
     assert hit([0, 0.25, 0.25], [1, 0, 0], 3.99)[0] == np.inf
     assert hit([4.0, 0.1, 0.1], [-1, 0, 0]) == (0.0, [8, 0, 0])  # begins on its face: it is the origin's own cell
-    assert hit([4.5, 0.1, 0.1], [-1, 0, 0]) == (0.0, [8, 0, 0])  # beside it, and enters at once
+    assert hit([4.5, 0.1, 0.1], [-1, 0, 0]) == (0.0, [8, 0, 0])  # next to it, and enters at once
     assert hit([4.5, 0.1, 0.1], [1, 0, 0])[0] == np.inf
     assert hit([4.5, 0.1, 0.1], [0, 1, 0])[0] == np.inf
     diagonal, cell = hit([0, 0, 0], [-1, -1, -1])  # from corner to corner

@@ -76,7 +76,7 @@ def test_transforms_that_only_tell_how_the_camera_is_mounted(tmp_path, ending):
         bag.depth(2)
     frame = Bag(bag.path).frame(0)
     assert frame.fault == "no_pose"
-    assert "tells how optical is mounted on camera_link, not where that was; put poses" in frame.fault_detail
+    assert "reports how optical is mounted on camera_link, not where that was; put poses" in frame.fault_detail
 
 
 def test_frames_that_tf_does_not_know(tmp_path):

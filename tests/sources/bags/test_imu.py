@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An accelerometer in a bag tells which way is up, where /tf says how it is mounted and it feels gravity alone."""
+"""An accelerometer in a bag reports which way is up, where /tf says how it is mounted and it feels gravity alone."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""List the frontiers of a map: groups of free cells beside unknown ones, each with a viewpoint to see it from."""
+"""List the frontiers of a map: groups of free cells next to unknown ones, each with a viewpoint to see it from."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _as_dict(frontier: Frontier) -> dict[str, Any]:
 
 
 def _print_frontiers(found: list[Frontier]) -> None:
-    say(f"{len(found)} frontiers" if found else "no frontier: no free cell lies beside an unknown one")
+    say(f"{len(found)} frontiers" if found else "no frontier: no free cell lies next to an unknown one")
     for n, frontier in enumerate(found[:MAX_PRINTED], 1):
         summary = _as_dict(frontier)
         where = "nowhere within reach" if summary["look_from"] is None else _format_point(summary["look_from"])

@@ -72,7 +72,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _usual_file(path: str) -> str:
-    """Return the name of the picture where none is given; raises StereovoxError where that would replace a file."""
+    """Return the name of the picture if none is given; raises StereovoxError if that would replace a file."""
     from stereovox.descriptions.description import command_line, picture_name
 
     name = picture_name(path)

@@ -4,7 +4,7 @@
 .bt, .ot and .graph of OctoMap; .npz of stereovox; clouds and meshes (.ply, .pcd, .las, .laz, .xyz, .csv, .txt, .asc,
 .pts, .bin of KITTI, .stl, .obj, .off): each cell that holds a point or a piece of surface becomes occupied; .bag,
 .mcap, .db3 and rosbag2 folders with an octomap_msgs/Octomap or a PointCloud2; .yaml of map_server with --heights. The
-size of cells is suggested where it is not given. Where MAP ends in .yaml, .pgm or .png, FILE is a floor's map, or a
+size of cells is suggested if it is not given. Where MAP ends in .yaml, .pgm or .png, FILE is a floor's map, or a
 bag with a nav_msgs/OccupancyGrid, and is saved as map_server files.
 """
 
@@ -75,7 +75,7 @@ def _import_grid(arguments: Namespace) -> dict[str, Any]:
         raise StereovoxError(
             f"{arguments.file}: holds a map in space; import it as M.svox, then: stereovox export M.svox floor.yaml"
         )
-    refuse_options(arguments, [*CLOUD_OPTIONS, "heights"], "a floor's map tells how large its cells are")
+    refuse_options(arguments, [*CLOUD_OPTIONS, "heights"], "a floor's map reports how large its cells are")
     grid, mode = _read_floor(arguments) if ending in SUFFIXES_2D else _read_bag(arguments)
     write_map_server(grid, arguments.map, mode)
     rows, columns = grid.cells.shape

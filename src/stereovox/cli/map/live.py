@@ -104,7 +104,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _cameras(arguments: Namespace) -> str | LiveCamera:
-    """Return the cameras; raises StereovoxError for a mount beside a file of several."""
+    """Return the cameras; raises StereovoxError for a mount next to a file of several."""
     from stereovox.live.rig import LiveCamera, mount_of
 
     if arguments.mount is None and arguments.clock_offset is None:

@@ -104,7 +104,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _usual_out(arguments: Namespace, ending: str) -> str:
-    """Return the name of the map where none is given; raises StereovoxError where that would replace something."""
+    """Return the name of the map if none is given; raises StereovoxError if that would replace something."""
     from stereovox.descriptions.description import map_name
 
     out = map_name(arguments.source, ending)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make a floor map from a robot's lidar and odometry by SLAM.
 
-Scans are matched, loops closed, and trajectory and map optimised together. The trajectory is saved beside the map
+Scans are matched, loops closed, and trajectory and map optimised together. The trajectory is saved next to the map
 (`.tum`). A map that its own scans speak against is written too, with warnings and exit status 3.
 """
 
@@ -30,7 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--out",
         required=True,
         metavar="MAP",
-        help="map_server files to write, for example floor.yaml; floor.tum beside it holds the trajectory",
+        help="map_server files to write, for example floor.yaml; floor.tum next to it holds the trajectory",
     )
     parser.add_argument("--relations", metavar="FILE", help="true relations between poses, to score the trajectory")
 

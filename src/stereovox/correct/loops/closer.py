@@ -66,7 +66,7 @@ class Loop:
         match: How the later one lies on it.
         off_m: Metres by which the poses were off.
         off_rad: Radians by which they were.
-        why: Why it was refused, in words; "" where it was not.
+        why: Why it was refused, in words; "" if it was not.
     """
 
     first: int
@@ -93,7 +93,7 @@ class LoopCloser:
         submaps: The submaps so far, with their poses as now believed.
         loops: The loops that are believed.
         refused: Places that look the same and are not believed to be.
-        shapes: What submaps show; None where it is too little.
+        shapes: What submaps show; None if it is too little.
         R_level_map: (3, 3) turns the map so that z points up.
         repeats: Where what submaps show looks the same a short way on.
 
@@ -155,7 +155,7 @@ class LoopCloser:
             self._hold(positions)
 
     def join(self, other: LoopCloser, T_map_other: Transform, loops: Sequence[Loop]) -> None:
-        """Put another recording beside this one, into one graph. Both are finished; call `finish` again.
+        """Put another recording next to this one, into one graph. Both are finished; call `finish` again.
 
         Args:
             other: All of the other recording.
@@ -284,7 +284,7 @@ class LoopCloser:
         return np.linalg.norm(middles[:-1] - middles[-1], axis=1)
 
     def _loop(self, first: int, second: int, later: Shape, covariance: NDArray[np.float64]) -> Loop | None:
-        """Return how a submap lies on an earlier one, within what the poses allow; None where it does not.
+        """Return how a submap lies on an earlier one, within what the poses allow; None if it does not.
 
         covariance: (6, 6) of where it stands as seen from the earlier one.
         """
@@ -310,7 +310,7 @@ class LoopCloser:
     def _rival_m(
         self, first: int, second: int, moved: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> float | None:
-        """Return how far away a submap may lie as well, where the surroundings repeat; None where it may not.
+        """Return how far away a submap may lie as well, where the surroundings repeat; None if it may not.
 
         moved: (6,) by how much it lies off where it is expected; covariance: (6, 6) of that.
         """
@@ -390,7 +390,7 @@ class LoopCloser:
 
 
 def check_one_way(history: History, frames: Sequence[KeptFrame]) -> None:
-    """Raise StereovoxError where a map's frames are not of a single way of cameras, so that no loops can be sought."""
+    """Raise StereovoxError if a map's frames are not of a single way of cameras, so that no loops can be sought."""
     if history.recordings > 1:
         raise StereovoxError(
             f"the map was merged of {history.recordings} recordings, which are no single way of a camera; close the "

@@ -58,7 +58,7 @@ class _Laid(NamedTuple):
 
 
 def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
-    """Return how a submap lies on an earlier one near T_earlier_later (4, 4); None where they do not show one place."""
+    """Return how a submap lies on an earlier one near T_earlier_later (4, 4); None if they do not show one place."""
     there = _laid(earlier.surfels, later.patches, guess)
     back = None if there is None else _laid(later.surfels, earlier.patches, inverse(there.T))
     if there is None or back is None:
@@ -76,7 +76,7 @@ def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
 
 
 def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | None:
-    """Return the pose that lays patches onto surfels; None where too few have one, or lie where it is."""
+    """Return the pose that lays patches onto surfels; None if too few have one, or lie where it is."""
     levels = surfels.levels(patches)[:LEVELS]
     middle = levels[1]
 

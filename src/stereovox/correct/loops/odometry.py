@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second odometry, such as that of wheels, beside the poses that frames come with."""
+"""A second odometry, such as that of wheels, next to the poses that frames come with."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Odometry:
         return moved_by(motion, gain @ moved), covariance - gain @ covariance
 
     def check(self) -> None:
-        """Raise StereovoxError where it was of no use at all, or is of another way or in another unit."""
+        """Raise StereovoxError if it was of no use at all, or is of another way or in another unit."""
         steps = self.used + self.contradicted
         if not steps:
             raise StereovoxError(f"{self.where}: has no poses at the times of the map's frames; give those of this way")

@@ -174,7 +174,7 @@ class _Shown:
         self._points = np.concatenate(points)
 
     def search(self, middle: NDArray[np.float64], half: NDArray[np.float64]) -> Search | None:
-        """Return the search in a part of it, by its middle (2,) and half size (2,); None where it shows nothing."""
+        """Return the search in a part of it, by its middle (2,) and half size (2,); None if it shows nothing."""
         near = (np.abs(self._points @ self._R_level_map.T[:, :2] - middle) <= half).all(axis=1)
         return Search(self._points[near], self._seeing(middle, half), self._R_level_map, CELL_M) if near.any() else None
 

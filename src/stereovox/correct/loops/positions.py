@@ -42,7 +42,7 @@ class Positions:
     contradicted: int = field(default=0, init=False)
 
     def at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return places (M, 3) at other times, interpolated; NaN where none is near enough."""
+        """Return places (M, 3) at other times, interpolated; NaN if none is near enough."""
         if not len(self.stamps_ns):
             return np.full((len(stamps_ns), 3), np.nan)
         after = np.searchsorted(self.stamps_ns, stamps_ns)
@@ -55,7 +55,7 @@ class Positions:
         return found
 
     def check(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Raise StereovoxError where places at so few of these times are known, or so close, that they cannot be laid
+        """Raise StereovoxError if places at so few of these times are known, or so close, that they cannot be laid
         into a map.
         """
         self._check(self.at(stamps_ns))
@@ -66,7 +66,7 @@ class Positions:
         """Return places (M, 3) turned about the vertical and shifted to where they fit best.
 
         Args:
-            found: (M, 3) places, NaN where there is none.
+            found: (M, 3) places, NaN if there is none.
             anchors: (M, 3) where the map has them.
             R_level_map: (3, 3) turns the map so that z points up.
 
@@ -89,7 +89,7 @@ class Positions:
         self.contradicted = int(np.count_nonzero(off_m > AWAY * self.sigma_m))
 
     def check_used(self) -> None:
-        """Raise StereovoxError where they are of another way or in another unit."""
+        """Raise StereovoxError if they are of another way or in another unit."""
         if self.contradicted > self.used:
             raise StereovoxError(
                 f"{self.where}: contradicts the way in {self.contradicted} of {self.contradicted + self.used} places; "
@@ -102,7 +102,7 @@ class Positions:
         return {"used": self.used, "contradicted": self.contradicted}
 
     def _check(self, found: NDArray[np.float64]) -> None:
-        """Raise StereovoxError where places (M, 3), NaN where there is none, are too few or too close to each other."""
+        """Raise StereovoxError if places (M, 3), NaN if there is none, are too few or too close to each other."""
         known = found[np.isfinite(found).all(axis=1)]
         span = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
         if len(known) < LEAST or span < WIDE * self.sigma_m:

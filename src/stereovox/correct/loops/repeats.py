@@ -93,7 +93,7 @@ def _agreeing(repeats: Sequence[_Repeat], shifts: NDArray[np.float64], shift: ND
 def _refined(
     shown: Sequence[tuple[Submap, Shape]], last: Submap, later: Shape, T: Transform
 ) -> NDArray[np.float64] | None:
-    """Return by how much (3,) a submap is shifted where it fits, near T_last_place (4, 4); None where it does not."""
+    """Return by how much (3,) a submap is shifted where it fits, near T_last_place (4, 4); None if it does not."""
     T_odom_place = last.T_odom_anchor @ T
     here = transform_points(T_odom_place, last.centre)
     away = [np.linalg.norm(transform_points(one.T_odom_anchor, one.centre) - here) for one, _ in shown]

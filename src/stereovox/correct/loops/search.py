@@ -17,7 +17,7 @@ from stereovox.track.views import GRID, View
 SEEDS = 300
 """Points of the later submap that are used."""
 ON, BESIDE, THROUGH = 2, 1, -2
-"""Scores of a point in a cell with a surface, in one beside such, and in one that was looked through."""
+"""Scores of a point in a cell with a surface, in one next to such, and in one that was looked through."""
 BEHIND_M = 0.4
 """A cell was looked through if it is nearer than what was seen by this."""
 TURN_STEP = np.radians(3.5)
@@ -128,7 +128,7 @@ class Search:
             slab.reshape(-1)[ahead[inside][free]] = THROUGH
 
     def _mark_surfaces(self, points: NDArray[np.float64]) -> None:
-        """Mark cells with a surface, and those beside them."""
+        """Mark cells with a surface, and those next to them."""
         from scipy.ndimage import binary_dilation
 
         there = np.zeros(self._grid.shape, bool)

@@ -110,7 +110,7 @@ class Shapes:
         self._held: OrderedDict[Submap, Shape | None] = OrderedDict()
 
     def __getitem__(self, submap: Submap) -> Shape | None:
-        """Return what a submap shows; None where it is too little."""
+        """Return what a submap shows; None if it is too little."""
         if submap not in self._held:
             self._held[submap] = self._made(submap)
             while len(self._held) > IN_MEMORY:

@@ -46,8 +46,8 @@ class SphereGrid:
     layout: the directions. range_m: float32 metres to the nearest surface where `reason` is VALID; up to which the
         direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nothing was seen.
     reason: uint8 of `Reason`, UNKNOWN where nothing was seen. count: int32 points of a cell.
-    stamp_ns: int64 time of a cell's range, NEVER where it has none.
-    camera: of all that took part the one whose ranges are the noisiest; None where none is known.
+    stamp_ns: int64 time of a cell's range, NEVER if it has none.
+    camera: of all that took part the one whose ranges are the noisiest; None if none is known.
     """
 
     layout: SphereLayout
@@ -93,7 +93,7 @@ def accumulate(
     T_body_sensor: (4, 4) maps the image's optical frame into the body's (x forward, y left, z up), the grid's origin.
     layout: the directions; without it those of `config.sphere`. A cell is TOO_NEAR where any of its pixels is, else
     VALID where any pixel has a depth, else TOO_FAR where any pixel is. Near the poles, where cells are narrower than
-    pixels, what lies between two pixels takes the nearest beside it.
+    pixels, what lies between two pixels takes the nearest next to it.
     """
     layout = layout or SphereLayout.configured(config.sphere)
     cells, camera = _new_cells(layout), image.camera
@@ -174,7 +174,7 @@ def stitch(grids: Sequence[SphereGrid]) -> SphereGrid:
     """Return one grid of several: in each direction the nearest wins and keeps its age (Valenti 2018, 5.4).
 
     A surface wins against what is only known to be free up to somewhere; at equal ranges the newest wins. Bounds may
-    differ. Raises ConfigError where steps differ.
+    differ. Raises ConfigError if steps differ.
     """
     layout = union([grid.layout for grid in grids])
     return reduce(_nearer, (_widened(grid, layout) for grid in grids), empty(layout))

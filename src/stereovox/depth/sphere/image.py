@@ -47,7 +47,7 @@ def through_sphere(image: DepthImage, config: Config) -> DepthImage:
 
     The grid's origin is the camera's eye, its pole the camera's y axis, its step `sphere.step_deg`; it reaches as far
     as the image, whatever bounds the settings name, so no pixel but those within two degrees of the pole is lost.
-    Raises FrameRefused `bad_camera` where it sees nothing else.
+    Raises FrameRefused `bad_camera` if it sees nothing else.
     """
     if config.sphere.step_deg is None:
         return image
@@ -99,7 +99,7 @@ def _image_of(layout: SphereLayout, eye: VirtualCamera | None) -> tuple[slice, S
 def _depth(
     grid: SphereGrid, columns: slice, camera: SphericalCamera, max_range: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the distance from the polar axis, 0 where there is none, and the reasons."""
+    """Return the distance from the polar axis, 0 if there is none, and the reasons."""
     depth = grid.range_m[:, columns] * np.cos(camera.angles()).astype(np.float32)
     reason = grid.reason[:, columns].copy()
     inner = np.cos(np.maximum(np.abs(camera.angles()) - camera.step_u / 2, 0)).astype(np.float32)
@@ -109,6 +109,6 @@ def _depth(
 
 
 def _special(depth: NDArray[np.float32], reason: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return depth with REP 117's values where there is none."""
+    """Return depth with REP 117's values if there is none."""
     none = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)[reason]
     return np.where(reason == Reason.VALID, depth, none)

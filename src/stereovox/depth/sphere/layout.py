@@ -62,7 +62,7 @@ class SphereLayout:
 
     @classmethod
     def configured(cls, config: SphereConfig) -> SphereLayout:
-        """Return the layout that the settings name. Raises ConfigError where they name no step."""
+        """Return the layout that the settings name. Raises ConfigError if they name no step."""
         if config.step_deg is None:
             raise ConfigError(
                 "sphere.step_deg is not set: there is no spherical grid; set it to degrees, for example 2"
@@ -125,7 +125,7 @@ class SphereLayout:
 
 
 def union(layouts: Sequence[SphereLayout]) -> SphereLayout:
-    """Return a layout that holds all of these. Raises ConfigError where their steps differ."""
+    """Return a layout that holds all of these. Raises ConfigError if their steps differ."""
     steps = sorted({layout.per_half_turn for layout in layouts})
     if len(steps) != 1:
         found = " and ".join(f"{180 / n:g}" for n in reversed(steps)) or "none"

@@ -47,7 +47,7 @@ class Sight:
 
 
 def range_in(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0, unseen: float = 0.0) -> Sight | None:
-    """Return how far one may fly towards `direction`, None where that is not known.
+    """Return how far one may fly towards `direction`, None if that is not known.
 
     direction: (3,) in the frame of the body, of any length. half_angle_deg: of a cone round it, all of which must be
     free; each cell that the cone touches counts. unseen: largest share of the cone that may be unknown; more than 0
@@ -67,7 +67,7 @@ def sight_of(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0
 
 
 def surroundings(grid: SphereGrid, half_angle_deg: float = 45.0) -> dict[str, Sight | None]:
-    """Return the nearest range round each of the six main directions of the body; None where nothing was seen."""
+    """Return the nearest range round each of the six main directions of the body; None if nothing was seen."""
     return {name: sight_of(grid, direction, half_angle_deg) for name, direction in MAIN_DIRECTIONS.items()}
 
 

@@ -25,7 +25,7 @@ def vehicle_grid(
     one line for each pair whose newest frame cannot be used. A depth camera has no name and counts as one that stands
     at the body's origin and looks ahead. So does a pair whose T_body_left is the identity: poses are then those of its
     optical frame, and the body has its axes turned to x forward, y left, z up, for all pairs.
-    Raises StereovoxError where no frame at all could be used.
+    Raises StereovoxError if no frame at all could be used.
     """
     newest, why, refused = _newest(frames)
     path, T_ahead_body = DepthPipeline(config), _axes(newest.values())

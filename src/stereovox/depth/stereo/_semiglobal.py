@@ -44,7 +44,7 @@ NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), n
 
 
 class Settings(NamedTuple):
-    """What `match` is told, in whole numbers.
+    """What `match` is reported, in whole numbers.
 
     radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of
     grey between both pixels. unique: per cent by which the second best match must be worse. left_right: most by which
@@ -417,7 +417,7 @@ def _claim(total, numbers, least, rival, owner, blocks):
 
 @cell
 def _second(total, numbers, best, blocks):
-    """Return the least cost of all disparities but `best` and those beside it."""
+    """Return the least cost of all disparities but `best` and those next to it."""
     least, before = FAR, np.uint16(best - SINGLE)
     for block in range(blocks):
         here = FAR

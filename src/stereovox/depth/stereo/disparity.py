@@ -24,7 +24,7 @@ FAR_PX = 0.5
 SURE = 0.5
 """Confidence that TOO_FAR needs, since it clears everything before it."""
 DOUBTFUL_PX, SEEN = 3.0, 4.0
-"""Matchers tend to find small disparities where there is no texture: below 3 px at least this much is needed."""
+"""Matchers tend to find small disparities if there is no texture: below 3 px at least this much is needed."""
 DOWN, ACROSS = 3, 7
 """Half sizes of the texture window, 7 rows and 15 columns."""
 

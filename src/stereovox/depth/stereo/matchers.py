@@ -50,6 +50,6 @@ class Matcher(Protocol):
 def make_matcher(config: StereoConfig) -> Matcher:
     """Return the configured matcher. Other packages register theirs in the entry point group `stereovox.matchers`.
 
-    Raises ConfigError for an unknown name, MissingExtra where a library is missing.
+    Raises ConfigError for an unknown name, MissingExtra if a library is missing.
     """
     return registry.find("matchers", MATCHERS, config.method)(config)

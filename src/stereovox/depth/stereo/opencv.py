@@ -107,7 +107,7 @@ class FourWay(_SemiGlobal):
 
 
 class Block(_OpenCv):
-    """Block matching: fast, and without values where there is no texture. Windows are at least 5 pixels wide."""
+    """Block matching: fast, and without values if there is no texture. Windows are at least 5 pixels wide."""
 
     def _make(self, config: StereoConfig) -> Any:
         import cv2

@@ -30,7 +30,7 @@ class StereoDepth:
     """Turns stereo frames into depth frames, as configured. Not for concurrent use by several threads."""
 
     def __init__(self, config: StereoConfig) -> None:
-        """Raises ConfigError for an unknown method, MissingExtra where its library is missing."""
+        """Raises ConfigError for an unknown method, MissingExtra if its library is missing."""
         self.config = config
         self._matchers = {bool(config.halve): make_matcher(_of_half(config) if config.halve else config)}
 
@@ -40,7 +40,7 @@ class StereoDepth:
         Depth is what `camera.depth_of` makes of the disparity, NaN: none. What is TOO_FAR has the depth beyond which
         it is: a map that reaches farther does not take it for free. It is never UNKNOWN, but UNMATCHED where the
         images do not agree, TOO_NEAR where the disparity is at the end of those searched, MASKED by rig and `rcrop`.
-        Raises as `disparity`, and StereovoxError where the pair's camera has no baseline.
+        Raises as `disparity`, and StereovoxError if the pair's camera has no baseline.
         """
         camera = frame.pair.camera
         if camera.baseline is None:

@@ -43,7 +43,7 @@ def rectified(frame: StereoFrame) -> StereoFrame:
     """Return the frame with both images rectified to `pair.camera`, and a pair without eyes.
 
     Unchanged where the pair has no eyes, and where the frame has a fault. `valid` and `valid_right` of the new pair are
-    False also where the lens sees nothing; the pixels there are 0. All frames of one pair get one and the same new
+    False also if the lens sees nothing; the pixels there are 0. All frames of one pair get one and the same new
     pair. Raises FrameRefused: `bad_shape` for images that are not of the lenses' sizes, `bad_dtype`.
     """
     if frame.pair.eyes is None or frame.fault:

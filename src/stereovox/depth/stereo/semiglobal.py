@@ -40,7 +40,7 @@ class Census:
     """
 
     def __init__(self, config: StereoConfig) -> None:
-        """Raises ConfigError where a window is so large that its sum of costs would overflow."""
+        """Raises ConfigError if a window is so large that its sum of costs would overflow."""
         if config.block_size**2 * MAX_COST > np.iinfo(np.uint16).max:
             raise ConfigError(
                 f"stereo.block_size {config.block_size}: too large for method={config.method}, its costs overflow; use "

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare a 2-D map with a reference: the error of IST 2019, Eq 7, and measures with a tolerance.
 
-As in IST 2019, IV-B, a cell is wrong where "the occupation value" differs, so there are three values, and a cell that
+As in IST 2019, IV-B, a cell is wrong if "the occupation value" differs, so there are three values, and a cell that
 only one of the maps knows is wrong too: the paper says so of a corridor that its camera never saw, which is white in
 Fig 6. An excluded region is "compensated in the error formula, as being, in fact, black": its cells count as right, and
 still belong to the free and occupied cells of the reference in the denominator.
 
 So Eq 7 adds up two things: coverage, what one of the maps never saw, and contradiction, where they say the opposite. A
-camera that sees less than a lidar has much of the first, a map that is wrong has much of the second; both are told.
+camera that sees less than a lidar has much of the first, a map that is wrong has much of the second; both are reported.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class CellErrors:
     eq7_coverage_percent, eq7_contradiction_percent: its two parts, which add up to it: cells that only one of the maps
         knows (missed, extra), and cells that both know and call by different states (wrongly occupied, wrongly free).
     eq7_outside_percent: the same as Eq 7 without excluded cells in the denominator; never less.
-    known_error_percent: of the cells known to both maps, those that differ; None where there are none.
+    known_error_percent: of the cells known to both maps, those that differ; None if missing.
     missed, wrongly_occupied, wrongly_free, extra: the cells that differ, see `Difference`; forgiven: those that differ
         in excluded regions and do not count.
     reference_occupied, reference_free: all such cells of the reference, including excluded ones.
@@ -129,7 +129,7 @@ def _percent(part: int, whole: int) -> float | None:
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances in metres from each of N cells to the nearest of others; None where either set is empty.
+    """Distances in metres from each of N cells to the nearest of others; None if either set is empty.
 
     mean, median, p95 (95th percentile), max.
     """
@@ -225,7 +225,7 @@ class GridScores:
     errors: Eq 7 and its parts. tally: over all cells the reference knows, where a cell unknown to the map is not
     called occupied; observed: over those known to both. error: mean squared error of the map's
     probabilities over those (Brier score). coverage: share of the reference's cells that the map knows.
-    occupied: how well the occupied cells match, exactly and within `tolerance_cells` along each axis, also where the
+    occupied: how well the occupied cells match, exactly and within `tolerance_cells` along each axis, also if the
     reference knows nothing; free_iou: intersection over union of the free cells.
     to_reference, from_reference: metres from each occupied cell of the map to the nearest of the reference, and back.
     motion: (3,) pose_reference_map by which the map was moved; aligned: whether it was searched for.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of an estimated trajectory beside the true ones of the same times."""
+"""Poses of an estimated trajectory next to the true ones of the same times."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MAX_DEFORMATION = 5e-3
 class PosePairs:
     """N pairs of an estimated and a true pose, in order.
 
-    stamps_ns: (N,) int64 nanoseconds of the estimate; None where the files have no times, and lines pair by number.
+    stamps_ns: (N,) int64 nanoseconds of the estimate; None if the files have no times, and lines pair by number.
     T_world_body, T_truth_body: (N, 4, 4) float64, estimated and true. estimate_poses, truth_poses: number of all poses
     of each. coverage: share of the truth's time span in which there are estimated poses without a gap (see
     MAX_GAP_S); without times, the share of the truth's poses that have a partner. estimate, truth: what they came

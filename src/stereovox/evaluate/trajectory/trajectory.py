@@ -117,7 +117,7 @@ def relation_errors(
 
     stamps_ns: (M,) int64, rising. poses: (M, 3) pose_map_base. Each time of a relation takes the pose nearest in time.
     The error is delta (-) delta*, length and angle apart: independent of the map's frame (Kuemmerle 2009, Eq 7).
-    Raises SourceError where no relation has poses.
+    Raises SourceError if no relation has poses.
     """
     stamps, poses = np.asarray(stamps_ns, np.int64), np.asarray(poses, float)
     closest = nearest(stamps, relations.stamps_ns)
@@ -142,9 +142,9 @@ class TrajectoryError:
     """Differences between N estimated poses and the true ones of the same times.
 
     position_rms_m to position_max_m: metres; yaw_rms_deg, yaw_max_deg: degrees (ATE).
-    step_rms_m, step_yaw_rms_deg: of motions over `step_m` metres of the true path (RPE); None where it is shorter.
+    step_rms_m, step_yaw_rms_deg: of motions over `step_m` metres of the true path (RPE); None if it is shorter.
     poses: N; without_truth: estimated poses without a true one at their time.
-    motion: (3,) pose_truth_map by which the estimate was aligned first; zero where it was not.
+    motion: (3,) pose_truth_map by which the estimate was aligned first; zero if it was not.
     """
 
     position_rms_m: float
@@ -172,7 +172,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
     align: first align the whole track with the true poses, rigidly and without scale (`best_motion`); for SLAM, whose
     map has a frame of its own.
     step_m: metres along the true path over which motions are compared.
-    Raises StereovoxError where no time of the track has a true pose.
+    Raises StereovoxError if no time of the track has a true pose.
     """
     true, known = true_poses(track.stamps_ns, truth)
     if not known.any():
@@ -199,7 +199,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
 
 
 def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[se2.Pose, NDArray[np.bool_]]:
-    """Return (N, 3) true poses at these times, NaN where none is near enough, and (N,) whether one is."""
+    """Return (N, 3) true poses at these times, NaN if none is near enough, and (N,) whether one is."""
     poses = np.full((len(stamps_ns), 3), np.nan)
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         try:

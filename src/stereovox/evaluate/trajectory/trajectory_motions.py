@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the motions between poses of a trajectory: by frame, by second, and over segments (KITTI's rule).
 
-Poses are (N, 4, 4) float64 rigid motions in metres, `found` beside `true` ones.
+Poses are (N, 4, 4) float64 rigid motions in metres, `found` next to `true` ones.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ def steps(found: Transforms, true: Transforms, start: NDArray[np.int64], end: ND
 
 
 def per_second(found: Transforms, true: Transforms, stamps_ns: NDArray[np.int64] | None) -> StepErrors | None:
-    """Return the errors of the motions from each pose to the one nearest to a second later; None where none is near.
+    """Return the errors of the motions from each pose to the one nearest to a second later; None if none is near.
 
-    stamps_ns: (N,) int64, not falling; None where they are not known.
+    stamps_ns: (N,) int64, not falling; None if they are not known.
     """
     if stamps_ns is None:
         return None

@@ -50,11 +50,11 @@ class TrajectoryScore:
     the two do not follow the same axes of the body, or where positions nearly on a line leave the roll about it open.
     length_m: of the truth, through its paired poses. duration_s: None without times.
     per_frame: RPE from each pair to the next. per_second: to the pair nearest to one second later (0.9 to 1.1 s); None
-    where there is none.
+    if there is none.
     segments: by their length, of those lengths that fit into the trajectory. translation_percent, rotation_deg_per_m:
     means over all of them; None without segments.
     drift_percent: by how much the end is off, in position, where the starts are laid on each other, of length_m; None
-    where the truth stands still.
+    if the truth stands still.
     """
 
     pairs: PosePairs
@@ -124,7 +124,7 @@ def score_trajectory(
         scale: Fit the scale, too (one camera without metres).
         max_difference_s: Poses further apart in time are no pair; by default 0.02 s.
         segments_m: Lengths in metres of KITTI's segments. By default 100 to 800 m where the truth is longer than
-            100 m, and 1, 2, 5, 10, 20, 50 m where it is not.
+            100 m, and 1, 2, 5, 10, 20, 50 m if it is not.
 
     Returns:
         The errors; position and rotation errors (ATE) after alignment, motions (RPE) independent of it but for scale.
@@ -177,7 +177,7 @@ def best_alignment(pairs: PosePairs, scale: bool = False) -> tuple[Transform, fl
 
     Least squares of positions (Umeyama 1991, Eq 38 to 43). Where they lie on a straight line, which leaves the roll
     about it open, rotations decide that.
-    Raises StereovoxError where one of the two stands still.
+    Raises StereovoxError if one of the two stands still.
     """
     ours, true = pairs.T_world_body[:, :3, 3], pairs.T_truth_body[:, :3, 3]
     a, b = ours - ours.mean(axis=0), true - true.mean(axis=0)

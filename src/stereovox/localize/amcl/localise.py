@@ -50,7 +50,7 @@ def localise(
     start, seed: as in `Localiser`; progress: called with the number of scans done. Where the particles disagree, the
     track follows the odometry, with the drift interpolated between the certain poses before and after; before the first
     certain pose it has that one's drift. Scans that later ones show to have a wrong stamp (`Clock`) are removed from
-    the track and counted too. Raises what `Localiser` raises, and SourceError where no scan can be trusted.
+    the track and counted too. Raises what `Localiser` raises, and SourceError if no scan can be trusted.
     """
     localiser, way, first_refusal = Localiser(grid, config, start, seed), _TrackBuilder(), ""
     for done, scan in enumerate(scans, 1):
@@ -196,8 +196,8 @@ class Estimate:
     covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
     pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
     particles: (N, 3) float64, equally likely poses in the map, as of the last update.
-    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
-    settled: tells whether nearly all particles agree; False while the robot may be in several places.
+    moved: reports whether the scan was compared with the map: at first, and then after moving far enough.
+    settled: reports whether nearly all particles agree; False while the robot may be in several places.
     ms: milliseconds the scan took.
     """
 
@@ -224,7 +224,7 @@ class Clock:
     def accept(self, scan: Scan) -> int:
         """Advance to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
 
-        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
+        Raises FrameRefused with the reason `not_in_order` if the scan is not later than the one before.
         """
         ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
         if ahead:
@@ -243,7 +243,7 @@ class Clock:
 
 
 class FreeFloor:
-    """The free cells of a map. Raises MapFileError where no cell is free, or none occupied."""
+    """The free cells of a map. Raises MapFileError if no cell is free, or none occupied."""
 
     def __init__(self, grid: OccupancyGrid):
         states = grid.states

@@ -159,7 +159,7 @@ class DistanceField:
 
 
 def distance_field(grid: OccupancyGrid, farthest: float = np.inf) -> DistanceField:
-    """Return the exact Euclidean distances of a map; all of it is `farthest` (metres) where nothing is occupied."""
+    """Return the exact Euclidean distances of a map; all of it is `farthest` (metres) if nothing is occupied."""
     from scipy.ndimage import distance_transform_edt
 
     occupied = grid.states == State.OCCUPIED
@@ -183,7 +183,7 @@ def beam_likelihood(
 ) -> NDArray[np.float64]:
     """Return how likely (1 / metre) ranges are where the map lets a beam go `expected` metres (Eq 6.4 to 6.12).
 
-    measured, expected: metres; at_max: bool, tells which met nothing up to `range_max`. Broadcast against each other.
+    measured, expected: metres; at_max: bool, reports which met nothing up to `range_max`. Broadcast against each other.
 
     Beams that met nothing have a probability and no density; it counts as if spread over a metre (table 6.1). Noise
     that carries a beam beyond `range_max` makes it one of them, so that the whole is 1, as the four shares are divided

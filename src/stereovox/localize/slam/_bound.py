@@ -52,7 +52,7 @@ def climb(places, side, pyramid, pad, least, taken, apart, best):
     """Find the turn and shift of a cloud with the largest score, if it is above `least`; return that score.
 
     places: (turns, N, 2) int32 row and column of each point for every turn tried. side: cells that it may shift each
-    way. best: (3,) int64 turn, rows, columns, written (as it was where nothing is above `least`). Score: the sum of
+    way. best: (3,) int64 turn, rows, columns, written (as it was if nothing is above `least`). Score: the sum of
     level 0 of `pyramid` over the points. Equal scores: the first in the order of the search, which is always the same.
     taken, apart: shifts within `apart` cells of those of `taken` (3,) int64 do not count; -1: all do.
     """

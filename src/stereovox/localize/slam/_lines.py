@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that turn the points of many scans into short lines, and a grid that tells which line is near.
+"""Kernels that turn the points of many scans into short lines, and a grid that reports which line is near.
 
 All coordinates are metres from the grid's corner. A slot is one cell that holds points; `index` tells its number.
 """
@@ -20,7 +20,7 @@ ROUND = np.float32(0.12)
 
 @kernel
 def bounds(points, least, most):
-    """Write the lowest and highest x, y of points (N, 2); leaves both as they are where there is none."""
+    """Write the lowest and highest x, y of points (N, 2); leaves both as they are if there is none."""
     for i in range(len(points)):
         for axis in range(2):
             value = points[i, axis]
@@ -134,7 +134,7 @@ def spread(cells, lines, cell, reach, sigma, near, score):
 
 @kernel
 def wipe(cells, reach, index, near, score):
-    """Undo `gather` and `spread` where they wrote: a grid is large and mostly empty."""
+    """Undo `gather` and `spread` if they wrote: a grid is large and mostly empty."""
     rows, columns = near.shape
     for slot in range(len(cells)):
         row, column = cells[slot, 0], cells[slot, 1]

@@ -98,7 +98,7 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
     """Move `pose` (3,) to where the points lie on the lines, and near `prior`; return how many points are on lines.
 
     Least squares of the distances over `sigma` metres with Geman and McClure's weights, plus the prior's
-    `information` (3, 3). A point counts where a line seen from the same side is near; at corners, where there is no
+    `information` (3, 3). A point counts where a line seen from the same side is near; at corners, if there is no
     line, both coordinates count, times `point_weight`.
     normal: (3, 3), written: information of the points alone, for x, y, yaw in the grid's frame.
     cost: (2,), written: the weighted mean of the squared distances in m^2, and the sum of weights.

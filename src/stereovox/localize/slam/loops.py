@@ -112,7 +112,7 @@ class LoopFinder:
         return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * path_m and abs(left[2]) < WITNESS[2])
 
     def _window(self, earlier: Submap, later: Submap, path_m: float) -> tuple[float, float] | None:
-        """Metres and radians to search for the later submap, None where it cannot show the same place."""
+        """Metres and radians to search for the later submap, None if it cannot show the same place."""
         config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
         if b.travelled - a.travelled < config.closure_path:
             return None
@@ -158,7 +158,7 @@ class ClosureSearch:
     def match(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
         """Return the best match of a cloud within `side` metres and `side_yaw` of a guess.
 
-        None where no place is good enough, or another one is nearly as good.
+        None if no place is good enough, or another one is nearly as good.
         """
         seeds = cloud.points[:: max(len(cloud.points) // SEEDS, 1)]
         if not len(seeds):
@@ -172,7 +172,7 @@ class ClosureSearch:
         return match
 
     def place(self, seeds: NDArray[np.float32], guess: se2.Pose, side: float, side_yaw: float) -> se2.Pose | None:
-        """Return the pose with the best score, None where it is below `closure_score` or has a rival."""
+        """Return the pose with the best score, None if it is below `closure_score` or has a rival."""
         cell, config = self._coarse.cell, self._config
         step = cell / max(float(np.sqrt((seeds**2).sum(axis=1).max())), 1.0)
         turns = int(np.ceil(side_yaw / step))

@@ -68,7 +68,7 @@ class OdometryCheck:
     def add(self, odometry: se2.Pose, before: se2.Pose, after: se2.Pose) -> Moment | None:
         """Take the odometry (3,) at a scan whose match moved the robot from `before` to `after`, (3,) each.
 
-        Return the moment since when both contradict each other, None where they agree.
+        Return the moment since when both contradict each other, None if they agree.
         """
         self._left = max(self._left - 1, 0)
         if not self._past:

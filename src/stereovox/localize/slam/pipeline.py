@@ -107,7 +107,7 @@ class Slam:
     def finish(self, progress: Progress | None = None) -> SlamResult:
         """Return the track and the map, after a last search for loops and a last refinement.
 
-        Raises StereovoxError where no scan could be used, MissingExtra where loops were found and gtsam is missing.
+        Raises StereovoxError if no scan could be used, MissingExtra if loops were found and gtsam is missing.
         """
         if not self.keyframes:
             counted = ", ".join(f"{number} x {reason}" for reason, number in self.refused.items())
@@ -157,7 +157,7 @@ class KeyframeMap:
         self._map, self._drawn = GridMap(self._config), np.empty((0, 3))
 
     def grid(self, keyframes: list[Keyframe]) -> OccupancyGrid:
-        """Return the map of all keyframes at their poses as of now. Raises StereovoxError where it is too wide."""
+        """Return the map of all keyframes at their poses as of now. Raises StereovoxError if it is too wide."""
         poses, drawn = np.array([keyframe.pose for keyframe in keyframes]), len(self._drawn)
         _check_extent(poses, self._settings.voxel_size)
         if not np.array_equal(poses[:drawn], self._drawn):
@@ -176,7 +176,7 @@ class SlamResult:
 
     track: the pose of every scan that was not refused. grid: the map, built from the keyframes. keyframes: with their
     final poses. closures: number of loops closed. edges: those, between keyframes. refused: refused scans by reason.
-    doubts: what the scans say against the map; empty where the self-check found nothing.
+    doubts: what the scans say against the map; empty if the self-check found nothing.
     """
 
     track: Track
@@ -211,7 +211,7 @@ class TrackBuilder:
         self._late, self._late_ns, self._against = 0, 0, 0
 
     def room(self, stamp_ns: int) -> int | None:
-        """Make room for a scan at `stamp_ns`; return how many earlier ones were dropped, None where it is itself too
+        """Make room for a scan at `stamp_ns`; return how many earlier ones were dropped, None if it is itself too
         late.
 
         A single stamp in the future would make all later scans late. So once more scans in a row are late than there

@@ -71,7 +71,7 @@ def remove(table, coords, values, count, gone):
 
 @kernel
 def find_all(table, coords, wanted, places):
-    """Write the places of blocks `wanted` (n, 3) to `places` (n,), -1 where there is none."""
+    """Write the places of blocks `wanted` (n, 3) to `places` (n,), -1 if there is none."""
     for i in range(wanted.shape[0]):
         places[i] = find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2])
 

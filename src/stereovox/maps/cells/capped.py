@@ -17,7 +17,7 @@ class CappedStorage(Storage):
     """The blocks of a map that refuses frames, as `memory_full`, if they need more blocks than fit into `max_memory`.
 
     Room for all of these is set aside at the start, so nothing is ever copied to grow; the system gives the memory of a
-    block when it is first used. What is refused depends only on the cells and the frame. Raises ConfigError where not
+    block when it is first used. What is refused depends only on the cells and the frame. Raises ConfigError if not
     even one block fits.
     """
 
@@ -30,7 +30,7 @@ class CappedStorage(Storage):
         self._times = CellTimes(config.map, self._most) if config.map.keep_times else None
 
     def go_on_with(self, earlier: Storage) -> None:
-        """Start from the cells of a map made before. Raises ConfigError where they do not fit."""
+        """Start from the cells of a map made before. Raises ConfigError if they do not fit."""
         earlier.check_cells(self.config)
         for coords, cells in earlier.slabs():
             rows, bare = self._pool.needed_by(cells)

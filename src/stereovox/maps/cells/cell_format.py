@@ -121,7 +121,7 @@ class CellRules:
         """Most that one frame may add to a cell, so that `confirm_hits` frames must hit it; None: whatever they say.
 
         Fewer frames never make an unknown cell occupied, which starts from the prior and skips "unknown" by one. Where
-        numbers are too coarse for exactly as many, it takes more. Raises ConfigError where they are far too coarse.
+        numbers are too coarse for exactly as many, it takes more. Raises ConfigError if they are far too coarse.
         """
         frames = self.config.confirm_hits
         if frames == 1:

@@ -18,7 +18,7 @@ UNIT_NS = 10_000_000
 """Times are kept in steps of 10 ms."""
 FIRST, LAST = 1 << 30, (1 << 32) - 1
 """The number of the time of the map's first frame; the largest there is. 124 days before and 373 days after the first
-frame can be told; what lies farther off counts as just so far."""
+frame can be reported; what lies farther off counts as just so far."""
 NEVER = int(_times.NEVER)
 LATE = 8
 """A cell is forgotten at most `forget_s` / LATE after its time is over."""
@@ -52,7 +52,7 @@ class CellTimes:
 
     @property
     def late_ns(self) -> float:
-        """How much longer than `forget_s` a cell may stay; infinite where none is forgotten."""
+        """How much longer than `forget_s` a cell may stay; infinite if none is forgotten."""
         return inf if self._forget_ns is None else self._forget_ns / LATE
 
     def steps(self, stamp_ns: int) -> np.uint32:
@@ -75,7 +75,7 @@ class CellTimes:
         _times.write(*self._arrays, evidence.coords, evidence.values, evidence.uniform, self.steps(stamp_ns))
 
     def get(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Return the times (n, 512) of blocks (n, 3), NEVER where there are none."""
+        """Return the times (n, 512) of blocks (n, 3), NEVER if there are none."""
         places = self._places(coords)
         found = np.zeros((len(coords), CELLS), np.uint32)
         found[places >= 0] = self._blocks.values[places[places >= 0]]

@@ -60,7 +60,7 @@ def names_of(family: Iterable[BoxEntry]) -> frozenset[str]:
 def write_parent(place: Place, layout: BoxLayout, children: Sequence[BoxEntry]) -> BoxEntry | None:
     """Write the box of the next level that covers `children`, all boxes of one family; return its entry.
 
-    layout: of the children. None where no coarse cell is known. Raises MapFileError as `read_box` and `write_box` do.
+    layout: of the children. None if no coarse cell is known. Raises MapFileError as `read_box` and `write_box` do.
     """
     parts = [halved(layout.rules, *read_box(place, layout, child)[:2]) for child in children]
     blocks = _joined(parts, layout.rules.format.unknown)

@@ -71,7 +71,7 @@ class BoxedManifest:
 def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
     """Make boxes that are in a place its map; an older one there is replaced at once.
 
-    Raises MapFileError where it cannot be written, or has so many boxes that it could not be read; the older map is
+    Raises MapFileError if it cannot be written, or has so many boxes that it could not be read; the older map is
     then as it was.
     """
     layout = manifest.layout
@@ -124,7 +124,7 @@ def sweep_boxes(place: Place, keep: Iterable[str] = ()) -> None:
 
 @contextmanager
 def only_writer_at(place: Place) -> Iterator[None]:
-    """Hold the right to write to a place. Raises MapFileError where another run has it.
+    """Hold the right to write to a place. Raises MapFileError if another run has it.
 
     A folder's is lifted by the system however its holder ends. A store knows no such thing: what a run leaves there
     that `kill -9` ended must be removed by hand, as the error says, which names that run.

@@ -24,7 +24,7 @@ PATIENCE_S = 0.1
 def only_writer_in(folder: Path) -> Iterator[None]:
     """Hold the right to write to `folder`, which is made, and is removed at the end if it is empty then.
 
-    Within one thread this may be entered again. Raises MapFileError where another process or thread is the writer and
+    Within one thread this may be entered again. Raises MapFileError if another process or thread is the writer and
     where the folder cannot be written.
     """
     with _made(folder), _held(folder, folder / LOCK, again=True):
@@ -40,7 +40,7 @@ def only_store_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
-    """Hold the right to write `file`, and `others` with it: as `only_writer_in`; the lock stands beside it.
+    """Hold the right to write `file`, and `others` with it: as `only_writer_in`; the lock stands next to it.
 
     What a writer left of them that was killed is removed.
     """

@@ -75,7 +75,7 @@ Slab = tuple[NDArray, ...]
 
 
 class SavedMap(NamedTuple):
-    """What a saved map holds; `times` is None where none were kept, `kept` where its frames were not."""
+    """What a saved map holds; `times` is None if none were kept, `kept` if its frames were not."""
 
     config: Config
     history: History
@@ -119,7 +119,7 @@ def save_map(storage: Storage, path: str | Path) -> None:
 
 
 def remove_map(folder: Path) -> None:
-    """Remove a saved map from its folder, which stays. Raises MapFileError where another run writes it."""
+    """Remove a saved map from its folder, which stays. Raises MapFileError if another run writes it."""
     with only_writer_in(folder):
         with suppress(OSError):
             (folder / MANIFEST).unlink(missing_ok=True)
@@ -361,7 +361,7 @@ def _let_writes_end() -> None:
 
 
 def _named(folder: Path) -> set[str]:
-    """Return the names of the saved cells and frames; none where there is no map, or a damaged one."""
+    """Return the names of the saved cells and frames; none if there is no map, or a damaged one."""
     with suppress(MapFileError, KeyError, TypeError):
         manifest = read_manifest(folder)
         return {str(manifest["data"]), *files_of_frames(manifest.get("kept_frames"))}

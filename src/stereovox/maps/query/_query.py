@@ -63,7 +63,7 @@ def state_of(stored, rules, number):
 
 @cell
 def level_of(stored, rules, wanted, row, marks, levels):
-    """Return the highest level among the cells of a block, -1 where none is wanted; `row` is what `row_of` gave.
+    """Return the highest level among the cells of a block, -1 if none is wanted; `row` is what `row_of` gave.
 
     Cells of a row are marked when it is first asked for; without a row all cells of a block are of one level.
     wanted: (n,) uint8, for each level the states that belong to it, bit by bit.
@@ -78,7 +78,7 @@ def level_of(stored, rules, wanted, row, marks, levels):
 
 @cell
 def _mark(stored, rules, wanted, row, marks):
-    """Set the marks of a row; return its highest level, -1 where nothing is wanted."""
+    """Set the marks of a row; return its highest level, -1 if nothing is wanted."""
     highest = np.int32(-1)
     for level in range(wanted.size):
         found = NO_BITS
@@ -95,7 +95,7 @@ def _mark(stored, rules, wanted, row, marks):
 
 @cell
 def _level(wanted, state):
-    """Return the level of a state, -1 where it is not wanted."""
+    """Return the level of a state, -1 if it is not wanted."""
     highest = np.int32(-1)
     for level in range(wanted.size):
         highest = np.int32(level) if (wanted[level] >> np.uint8(state)) & BIT else highest
@@ -104,7 +104,7 @@ def _level(wanted, state):
 
 @cell
 def extent(stored, low, high):
-    """Write the lowest and highest coordinates (3,) of all blocks with a row; low > high where there is none."""
+    """Write the lowest and highest coordinates (3,) of all blocks with a row; low > high if there is none."""
     low[:] = NOWHERE
     high[:] = -NOWHERE
     for i in stored.table:

@@ -29,7 +29,7 @@ def nearest(stored, rules, wanted, side, points, farthest, distance, cells):
 
 @cell
 def _nearest(stored, rules, wanted, side, p, farthest, lately, marks, levels):
-    """Return the squared distance of the nearest wanted cell, infinite where none is near enough, and the cell.
+    """Return the squared distance of the nearest wanted cell, infinite if none is near enough, and the cell.
 
     Where more blocks were asked for than the hash has slots, the shells stand in nothing, and the rows that there are
     are looked through instead. Not so where what is not there is wanted: then it was found long before.

@@ -135,7 +135,7 @@ def _meets(start, per_cell, face):
 
 @cell
 def _worth_clipping(stored, wanted, side, metres):
-    """Tell whether rays of that many metres ask for more blocks than the table has slots, and run on where none is."""
+    """Tell whether rays of that many metres ask for more blocks than the table has slots, and run on if none is."""
     blocks = 3 * metres / (8 * min(side[0], min(side[1], side[2])))
     return blocks > stored.table.size and (wanted[0] & UNKNOWN_BIT) == 0
 

@@ -13,7 +13,7 @@ from stereovox.maps.query._query import LATELY, NOWHERE, cells_from_zero, level_
 
 UNKNOWN_LEVEL, WORST_LEVEL = np.int32(0), np.int32(2)
 SLACK = 1e-9
-"""Blocks that much farther off are asked for too: what touches is told cell by cell."""
+"""Blocks that much farther off are asked for too: what touches is reported cell by cell."""
 ZERO, ONE, EVERY_ROW = np.uint64(0), np.uint64(1), np.uint64(0x0101010101010101)
 
 
@@ -92,7 +92,7 @@ def _worst_of_rows_in_box(stored, rules, wanted, box, worst, lately, marks, leve
 
 @cell
 def _worse_in_box(stored, rules, wanted, box, bx, by, bz, worst, lately, marks, levels):
-    """Return the worst level of the cells of a block that lie in a box, or `worst` where none is worse."""
+    """Return the worst level of the cells of a block that lie in a box, or `worst` if none is worse."""
     row = row_again(stored, lately, bx, by, bz)
     top = level_of(stored, rules, wanted, row, marks, levels)
     if row < 0 or top <= worst:
@@ -163,7 +163,7 @@ def _shrunk(start, slope, t, until, reach, low, high):
 
 @cell
 def _worse_in_capsule(stored, rules, wanted, side, solid, bx, by, bz, worst, lately, marks, levels):
-    """Return the worst level of the cells of a block that a capsule touches, or `worst` where none is worse."""
+    """Return the worst level of the cells of a block that a capsule touches, or `worst` if none is worse."""
     row = row_again(stored, lately, bx, by, bz)
     top = level_of(stored, rules, wanted, row, marks, levels)
     if top <= worst or not _touches(solid, side, 8 * bx, 8 * by, 8 * bz, 8):

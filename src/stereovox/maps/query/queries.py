@@ -40,8 +40,8 @@ class RayHits(NamedTuple):
 
     distance: (N,) float32 metres from the origin to where the ray enters the cell that stops it; infinite where none
         does.
-    cell: (N, 3) int32 this cell, NO_CELL where there is none.
-    state: (N,) uint8 `State` of this cell, UNKNOWN where there is none.
+    cell: (N, 3) int32 this cell, NO_CELL if there is none.
+    state: (N,) uint8 `State` of this cell, UNKNOWN if there is none.
     """
 
     distance: NDArray[np.float32]
@@ -59,8 +59,8 @@ class RayHits(NamedTuple):
 class NearestCells(NamedTuple):
     """What is nearest to points.
 
-    distance: (N,) float32 metres to the nearest face of the cell, 0 within it; infinite where nothing is near enough.
-    cell: (N, 3) int32 this cell, NO_CELL where there is none; one of them where several are as near.
+    distance: (N,) float32 metres to the nearest face of the cell, 0 within it; infinite if nothing is near enough.
+    cell: (N, 3) int32 this cell, NO_CELL if there is none; one of them where several are as near.
     """
 
     distance: NDArray[np.float32]

@@ -57,7 +57,7 @@ class Agreement(NamedTuple):
 
     @property
     def against(self) -> float | None:
-        """Share of them that is against the map, 0 to 1; None where there are too few to tell.
+        """Share of them that is against the map, 0 to 1; None if there are too few to tell.
 
         What is new is often seen first where noise at the end of the range has cleared some cells before; so a frame
         is judged only where a good part of what it sees is known, or where it looks through much; and what is at the

@@ -123,8 +123,8 @@ class History:
         looks: Last image of each camera.
         usual: Usual disagreement with the map of each camera's frames, 0 to 1.
         doubts: Cameras whose last frames disagree with the map more than usual.
-        imported: The file of another program that the map began with; None where there was none.
-        loops: The loops that were closed; None where none were sought, or poses were corrected otherwise since.
+        imported: The file of another program that the map began with; None if there was none.
+        loops: The loops that were closed; None if none were sought, or poses were corrected otherwise since.
         recordings: Number of recordings that were merged as their poses said; 1 where none were, or `join` made one way
             of them, which it can where one was made after the other.
     """

@@ -44,7 +44,7 @@ class Bytes(Protocol):
         ...
 
     def read(self) -> bytes:
-        """Return the bytes. Raises MapFileError where they are gone or damaged."""
+        """Return the bytes. Raises MapFileError if they are gone or damaged."""
         ...
 
 
@@ -78,7 +78,7 @@ class InFile:
     digest: str
 
     def read(self) -> bytes:
-        """Return the bytes. Raises MapFileError where they are gone or damaged."""
+        """Return the bytes. Raises MapFileError if they are gone or damaged."""
         file, start = place = self.place
         try:
             content = read_part(file, start, self.size)
@@ -114,7 +114,7 @@ class Packed(NamedTuple):
         return cls(depth.dtype.name, len(parts[0]), InMemory(content), digest_of(content))
 
     def unpacked(self, camera: VirtualCamera) -> tuple[NDArray[np.generic], NDArray[np.uint8] | None]:
-        """Return depth and reasons (height, width) as they were. Raises MapFileError where they cannot be read."""
+        """Return depth and reasons (height, width) as they were. Raises MapFileError if they cannot be read."""
         content, shape = self.content.read(), (camera.height, camera.width)
         try:
             depth = _unpacked(content[: self.depth_bytes], shape, np.dtype(self.dtype))
@@ -151,7 +151,7 @@ class PackedCloud(NamedTuple):
         return cls(dtype.name, (points, clear, origins), sizes, InMemory(content), digest_of(content))
 
     def unpacked(self) -> list[NDArray[Any] | None]:
-        """Return points, clear and origins as they were. Raises MapFileError where they cannot be read."""
+        """Return points, clear and origins as they were. Raises MapFileError if they cannot be read."""
         content, starts = self.content.read(), np.cumsum([0, *self.sizes])
         try:
             return [
@@ -197,7 +197,7 @@ class KeptFrame:
     blocks: NDArray[np.int32]
 
     def frame(self) -> Frame | Cloud:
-        """Return the frame, its photo left out, from its present pose. Raises MapFileError where it cannot be read."""
+        """Return the frame, its photo left out, from its present pose. Raises MapFileError if it cannot be read."""
         if isinstance(self.camera, Lidar):
             return self._cloud(self.camera)
         assert isinstance(self.packed, Packed)
@@ -315,7 +315,7 @@ def kept_frame(
 
 
 def blocks_seen(evidence: Evidence) -> NDArray[np.int32]:
-    """Return the lowest block with evidence and the first beyond the highest (2, 3), zeros where there is none."""
+    """Return the lowest block with evidence and the first beyond the highest (2, 3), zeros if there is none."""
     parts = [coords for coords in (evidence.coords, evidence.uniform) if len(coords)]
     if not parts:
         return NOWHERE
@@ -365,7 +365,7 @@ def _encoded(array: NDArray[np.uint8]) -> bytes:
 
 
 def _decoded(content: bytes, size: int) -> bytes:
-    """Return what zstd makes of bytes. Raises ValueError where that is not just `size` bytes, and RuntimeError."""
+    """Return what zstd makes of bytes. Raises ValueError if that is not just `size` bytes, and RuntimeError."""
     from numcodecs.zstd import Zstd
 
     if zstd_size(content[:18]) != size:

@@ -114,7 +114,7 @@ class BoxedStorage(Storage):
 
     @property
     def stored_cells(self) -> StoredCells:
-        """All cells, for kernels that only read. Raises StereovoxError where they do not fit into the cache."""
+        """All cells, for kernels that only read. Raises StereovoxError if they do not fit into the cache."""
         self._load(self._entries)
         return self._pool.stored_cells
 
@@ -125,7 +125,7 @@ class BoxedStorage(Storage):
         return self._pool.stored_cells
 
     def cells_of(self, coords: NDArray[np.int32]) -> NDArray[np.integer]:
-        """Return the cells (n, 512) as stored of blocks (n, 3), all unknown where there is none."""
+        """Return the cells (n, 512) as stored of blocks (n, 3), all unknown if there is none."""
         cells = np.full((len(coords), CELLS), self.cell_format.unknown, self.cell_format.dtype)
         for part in self._parts_of_blocks(coords):
             cells[part] = self._cells_in(self._pool.stored_cells, coords[part])
@@ -142,7 +142,7 @@ class BoxedStorage(Storage):
         return stored
 
     def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Return the times (n, 512) of the cells of blocks (n, 3), NEVER where there is none."""
+        """Return the times (n, 512) of the cells of blocks (n, 3), NEVER if there is none."""
         times = np.zeros((len(coords), CELLS), np.uint32)
         for part in self._parts_of_blocks(coords):
             times[part] = self._kept_times.get(coords[part])

@@ -52,7 +52,7 @@ Index = tuple[int, int, int]
 class BoxBlocks(NamedTuple):
     """The blocks of a box.
 
-    coords: (n, 3) int32 in ascending order; cells: (n, 512) as stored; times: (n, 512) uint32, None where none are
+    coords: (n, 3) int32 in ascending order; cells: (n, 512) as stored; times: (n, 512) uint32, None if none are
     kept; they count from `times_start_ns`.
     """
 
@@ -160,10 +160,10 @@ class BoxLayout:
 
 
 def write_box(place: Place, layout: BoxLayout, index: Sequence[int], storage: Storage) -> BoxEntry | None:
-    """Write the blocks that `storage` has in one box; return its entry for a manifest, None where no cell is known.
+    """Write the blocks that `storage` has in one box; return its entry for a manifest, None if no cell is known.
 
     Nothing is a part of any map until a manifest names it. The same content has the same name, so a box that is written
-    again after a kill takes no more room. Raises MapFileError where it cannot be written.
+    again after a kill takes no more room. Raises MapFileError if it cannot be written.
     """
     coords, cells = storage.blocks_within(*layout.blocks_of(index))
     order = np.lexsort(coords.T[::-1])
@@ -199,7 +199,7 @@ def write_blocks(place: Place, layout: BoxLayout, index: Sequence[int], blocks: 
 
 
 def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
-    """Read the blocks of one box. Raises MapFileError, one line that names the box, where it is missing or damaged."""
+    """Read the blocks of one box. Raises MapFileError, one line that names the box, if it is missing or damaged."""
     files = [f"{entry.name}/{_shard(name)}" for name in ARRAYS[: len(layout.dtypes)]]
     shards = [data for file in files if (data := place.find(file, entry.bytes)) is not None]
     if len(shards) < len(files):
@@ -245,7 +245,7 @@ def _packed(layout: BoxLayout, arrays: list[NDArray]) -> dict[str, bytes]:
 
 
 def _unpacked(shard: bytes, blocks: int, width: int, dtype: np.dtype[Any]) -> NDArray:
-    """Return the array (blocks, width) in a shard; raises ValueError where its chunks would not unpack to just that.
+    """Return the array (blocks, width) in a shard; raises ValueError if its chunks would not unpack to just that.
 
     Zarr reads it as well, in ten times as long.
     """

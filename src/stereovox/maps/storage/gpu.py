@@ -192,7 +192,7 @@ class GpuPool:
         except MemoryError:
             raise FrameRefused(
                 "memory_full",
-                f"the graphics card has no room for the blocks of a frame beside the map's {self._used}; "
+                f"the graphics card has no room for the blocks of a frame next to the map's {self._used}; "
                 'use larger cells, or device "cpu" with max_memory or a window',
             ) from None
 
@@ -215,7 +215,7 @@ class GpuPool:
         return int(counts[_gpu.CHANGED])
 
     def _find(self, evidence: GpuEvidence) -> None:
-        """Write to `_places` where the blocks of evidence are, and count those that are missing."""
+        """Write to `_places` if the blocks of evidence are, and count those that are missing."""
         (coords, _, said, uniform, steps), n, m = evidence.arrays, evidence.n, evidence.m
         for places, wanted, given, size in zip(self._places, (coords, uniform), (said, steps), (n, m), strict=True):
             launch(_gpu.find_places, self._table, self._coords, wanted, given, size, places, self._counts)

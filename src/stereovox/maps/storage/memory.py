@@ -32,7 +32,7 @@ def pool_bytes(config: Config, blocks: int) -> int:
 
 
 def most_blocks(config: Config) -> int:
-    """Return how many blocks fit into `max_memory`. Raises ConfigError where none does."""
+    """Return how many blocks fit into `max_memory`. Raises ConfigError if none does."""
     allowed = int(config.max_memory or 0)
     most = _largest(lambda blocks: pool_bytes(config, blocks) <= allowed, MAX_BLOCKS)
     if not most:
@@ -41,7 +41,7 @@ def most_blocks(config: Config) -> int:
 
 
 def window_blocks(config: Config) -> int:
-    """Return how many blocks the window touches at most, with those that its tiles on disk have beside it."""
+    """Return how many blocks the window touches at most, with those that its tiles on disk have next to it."""
     assert config.window.size is not None
     unit = TILE if config.window.outside == "keep" else SIDE
     return (
@@ -51,7 +51,7 @@ def window_blocks(config: Config) -> int:
 
 
 def within_memory(config: Config) -> Config:
-    """Return the settings with the window that `max_memory` and `when_full` make; as they are where none is asked for.
+    """Return the settings with the window that `max_memory` and `when_full` make; as they are if none is asked for.
 
     A window that is not given is the largest that fits, about half as high as wide. Raises ConfigError, one line
     with the cure, for one that does not fit, and where not even the view does: that of a camera at the border of the
@@ -101,7 +101,7 @@ def _widest(config: Config) -> float:
 
 
 def _as_wide(config: Config, width: float) -> Config:
-    """Return the settings with a window of this width, and half as high beside the way that the trigger box leaves."""
+    """Return the settings with a window of this width, and half as high next to the way that the trigger box leaves."""
     up = "xyz".index(config.up[-1])
     size = tuple(width / 2 + config.window.trigger if axis == up else width for axis in range(3))
     return _with_window(config, size=size, largest=None)

@@ -141,7 +141,7 @@ class RollingStorage(Storage):
 
     @property
     def times_start_ns(self) -> int | None:
-        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
+        """Stamp in nanoseconds from which times of cells are counted; None before the first and if none are kept."""
         return super().times_start_ns if self._earlier is None else self._earlier.times_start_ns
 
     def close(self) -> None:

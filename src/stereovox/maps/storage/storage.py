@@ -81,7 +81,7 @@ class Storage(Guarded):
         listeners: Called with the evidence after every `add`, the lock held. No other block has changed, but for those
             that a window or time took away. After a correction of poses with `uniform` evidence of 0 on all blocks
             that were made anew.
-        kept: The depth images of all frames; None where they are not kept.
+        kept: The depth images of all frames; None if they are not kept.
         rules: What stored numbers mean.
         cell_format: How log-odds are stored.
     """
@@ -127,7 +127,7 @@ class Storage(Guarded):
         self.config = config
 
     def check_can_grow(self) -> None:
-        """Raise StereovoxError where nothing can be added to this map; here it can."""
+        """Raise StereovoxError if nothing can be added to this map; here it can."""
 
     def take_history(self, earlier: Storage) -> None:
         """Take over what `earlier` remembers of its frames."""
@@ -152,7 +152,7 @@ class Storage(Guarded):
         return self._pool.block_coords
 
     def replace_blocks(self, coords: NDArray[np.int32], other: Storage) -> None:
-        """Take over blocks (n, 3) from a map of the same settings, with their times; unknown where it has none."""
+        """Take over blocks (n, 3) from a map of the same settings, with their times; unknown if it has none."""
         coords = np.ascontiguousarray(coords, np.int32)
         self._pool.remove(coords)
         if self._times is not None:
@@ -220,7 +220,7 @@ class Storage(Guarded):
         return self.stored_cells
 
     def cells_of(self, coords: NDArray[np.int32]) -> NDArray[np.integer]:
-        """Return the cells (n, 512) as stored of blocks (n, 3) in memory; all unknown where there is none."""
+        """Return the cells (n, 512) as stored of blocks (n, 3) in memory; all unknown if there is none."""
         return self._cells_in(self.stored_cells, coords)
 
     def stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
@@ -257,9 +257,9 @@ class Storage(Guarded):
         yield from in_steps(self.lock, self._pool.pieces())
 
     def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
-        """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 where there is none.
+        """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 if there is none.
 
-        Raises StereovoxError where the map keeps no times. What they mean: `CellTimes`.
+        Raises StereovoxError if the map keeps no times. What they mean: `CellTimes`.
         """
         yield from in_steps(self.lock, self._timed())
 
@@ -288,7 +288,7 @@ class Storage(Guarded):
 
     @property
     def times_start_ns(self) -> int | None:
-        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
+        """Stamp in nanoseconds from which times of cells are counted; None before the first and if none are kept."""
         return None if self._times is None else self._times.start_ns
 
     @property

@@ -48,7 +48,7 @@ class TileStore:
     """Tiles of 32x32x32 cells by their coordinates (cell index // 32).
 
     folder: it must be empty or not exist or hold what a run left that was killed; `close` removes it. By default a
-    temporary one that goes with this object. Raises MapFileError where the folder cannot be used, or another run does.
+    temporary one that goes with this object. Raises MapFileError if the folder cannot be used, or another run does.
     """
 
     def __init__(self, cell_format: CellFormat, folder: Path | None = None):
@@ -84,7 +84,7 @@ class TileStore:
         self._forget_written()
 
     def check(self) -> None:
-        """Raise MapFileError where a tile could not be written."""
+        """Raise MapFileError if a tile could not be written."""
         self._forget_written()
         if self._failed is not None:
             why = self._failed.strerror or self._failed
@@ -162,7 +162,7 @@ class TileStore:
         self._array[_place(tile)] = _to_cells(dense)
 
     def _read(self, tile: Tile) -> NDArray:
-        """Return what was written. Raises MapFileError where the disk does not hold it any more."""
+        """Return what was written. Raises MapFileError if the disk does not hold it any more."""
         try:
             dense = _to_blocks(np.asarray(self._array[_place(tile)]))
         except (OSError, ValueError, RuntimeError) as error:

@@ -75,7 +75,7 @@ def checked_band(heights: Heights) -> Heights:
 
 
 def check_level(config: Config) -> None:
-    """Raise StereovoxError where the layers of a map are so far from level that they show no floor."""
+    """Raise StereovoxError if the layers of a map are so far from level that they show no floor."""
     if config.tilt > MAX_TILT:
         tilt = f"{np.degrees(config.tilt):.0f} degrees off {config.up}"
         raise StereovoxError(f"up is {tilt}, so no layer of the map is level; map the recording again with --level")

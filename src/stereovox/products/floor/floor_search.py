@@ -4,7 +4,7 @@
 A surface has room for a robot above it and was seen from above. Surfaces grow together from cell to cell; the floor is
 the lowest large group under the camera, and what continues it beyond gaps. Three things are no floor: what rises too
 fast above lower floor nearby (furniture whose noise reads as a stair), what lies under another storey on which the
-camera is, and a surface beside which much free space lies deeper (a table whose floor was not seen).
+camera is, and a surface next to which much free space lies deeper (a table whose floor was not seen).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FloorSearch:
         self._step = max(1, int(STEP / floor.side + TIE))
 
     def levels(self) -> NDArray[np.int64]:
-        """Return the level (rows, columns) in cells of the floor's upper face; NO_SURFACE where it was not seen."""
+        """Return the level (rows, columns) in cells of the floor's upper face; NO_SURFACE if it was not seen."""
         surfaces = self._floor.surfaces(ROOM, max(STEP, self._floor.side))
         first = self._grown(surfaces)
         kept = first[tuple(surfaces[:, :2].T)] == surfaces[:, 2]
@@ -110,7 +110,7 @@ class FloorSearch:
         return None
 
     def _stands(self, surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which groups stand above something lower: a box beside a floor that is as high as its top."""
+        """Return which groups stand above something lower: a box next to a floor that is as high as its top."""
         from scipy.ndimage import minimum_filter
 
         window = 2 * max(1, round(BESIDE_M / self._floor.resolution)) + 1
@@ -155,7 +155,7 @@ class FloorSearch:
 
     @cached_property
     def _lowest_free(self) -> NDArray[np.int64]:
-        """The level (rows, columns) of the lowest free cell's bottom; NO_SURFACE where nothing is free."""
+        """The level (rows, columns) of the lowest free cell's bottom; NO_SURFACE if nothing is free."""
         floor = self._floor
         free = np.floor(floor.voxel_map.free() / floor.voxel_map.config.cell).astype(np.int64)
         x, y, up = free[:, floor.axes].T

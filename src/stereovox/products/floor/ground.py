@@ -36,7 +36,7 @@ def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | N
     floors overlap, the one nearest in height to `start` counts, or else the lower one.
 
     A cell is drivable where all room above the step is free, the slope (of the plane that fits best within the robot's
-    radius) is not too steep, and there is no step beside it. Where no ground was seen, something occupied in the
+    radius) is not too steep, and there is no step next to it. Where no ground was seen, something occupied in the
     robot's height above the nearest ground is an obstacle, a surface more than a step below it a drop; everything else
     is unknown. The footprint of the robot is not included: inflate the grid for that.
 
@@ -124,7 +124,7 @@ class Footing(IntEnum):
 def write_ground(found: Ground, path: str | Path) -> None:
     """Write a `Ground` for `numpy.load`: its arrays, `resolution` in metres, and `origin` x, y, yaw.
 
-    Raises MapFileError where the file cannot be written.
+    Raises MapFileError if the file cannot be written.
     """
     with replacing(path) as file:
         np.savez_compressed(file, **asdict(found))
@@ -134,7 +134,7 @@ def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[n
     """Return the slope (rows, columns), rise over run, of the plane that best fits the heights around each cell.
 
     height: (rows, columns) metres, NaN for none. The square around a cell extends `radius` metres to each side, at
-    least two cells. 0 where there is no height, or where the heights lie on one line of cells.
+    least two cells. 0 if there is no height, or where the heights lie on one line of cells.
     """
     from scipy.ndimage import correlate1d
 
@@ -182,9 +182,9 @@ def _on_ground(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArr
 
 
 def _off_ground(floor: Floor, height: NDArray[np.float64], lower: NDArray[np.int64], robot: Robot) -> NDArray[np.uint8]:
-    """Return the `Footing` (rows, columns) where there is none, seen from the nearest ground.
+    """Return the `Footing` (rows, columns) if there is none, seen from the nearest ground.
 
-    lower: (rows, columns) the lowest surface there, in cells, as high as can be where there is none.
+    lower: (rows, columns) the lowest surface there, in cells, as high as can be if there is none.
     """
     from scipy.ndimage import distance_transform_edt
 

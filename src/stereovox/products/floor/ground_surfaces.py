@@ -19,11 +19,11 @@ from stereovox.products.side_by_side import in_memory
 TIE = 1e-6
 """Cells: lengths that are so near to whole cells are."""
 NO_SURFACE = 2**40
-"""Stands for a level, in cells, where there is no surface."""
+"""Stands for a level, in cells, if there is no surface."""
 LARGE = 0.25
 """A floor has at least such a part of the cells of the largest surface: tables may be seen better than floors."""
 BESIDE = ((1, 0), (0, 1), (1, 1), (1, -1))
-"""Half of the eight columns beside one."""
+"""Half of the eight columns next to one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Floor:
 
 
 def floor_of(voxel_map: VoxelMap) -> Floor:
-    """Return the columns of a map; raises StereovoxError where nothing is known, or they are too many."""
+    """Return the columns of a map; raises StereovoxError if nothing is known, or they are too many."""
     voxel_map = in_memory(voxel_map)
     x, y, up, sign = floor_axes(voxel_map.config.up)
     if voxel_map.config.cell[x] != voxel_map.config.cell[y]:
@@ -99,7 +99,7 @@ def floor_of(voxel_map: VoxelMap) -> Floor:
 def ground_levels(
     floor: Floor, height: float, step: float, start: ArrayLike | None
 ) -> tuple[np.ma.MaskedArray, NDArray[np.int64]]:
-    """Return the level of the ground (rows, columns) in cells, masked where there is none, and of the lowest surface.
+    """Return the level of the ground (rows, columns) in cells, masked if there is none, and of the lowest surface.
 
     What is NO_SURFACE has no surface at all. Raises StereovoxError if there is no ground.
     """

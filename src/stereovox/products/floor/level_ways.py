@@ -55,7 +55,7 @@ class LevelPlanner:
     def middle(self) -> tuple[NDArray[np.float64], float] | None:
         """Return the place (3,) it can come to with the most room about it, and that room in metres.
 
-        This is the middle of a room as far as it is known (Chien 2020, 5.1). None where it cannot move at all.
+        This is the middle of a room as far as it is known (Chien 2020, 5.1). None if it cannot move at all.
         """
         room = np.where(np.isfinite(self._search[0].reshape(self._room.shape)), self._room, -1)
         best = np.unravel_index(np.argmax(room), room.shape)
@@ -69,7 +69,7 @@ class LevelPlanner:
             near: Metres by which the end may miss the goal.
 
         Returns:
-            Places at the start's height; None where there is no way.
+            Places at the start's height; None if there is no way.
         """
         reached = np.flatnonzero(np.isfinite(self._search[0]))
         if not len(reached):
@@ -101,7 +101,7 @@ class LevelPlanner:
 
     @cached_property
     def _search(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Lengths of the ways to all columns (n * m,), infinite where there is none, and the column before each."""
+        """Lengths of the ways to all columns (n * m,), infinite if there is none, and the column before each."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 

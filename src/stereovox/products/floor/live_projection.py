@@ -91,7 +91,7 @@ class LiveProjection:
         return self._floor
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the current map from above, None where nothing is known. Its cells are a copy.
+        """Return the current map from above, None if nothing is known. Its cells are a copy.
 
         Raises StereovoxError for too large a grid.
         """

@@ -40,7 +40,7 @@ def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.floa
     """Return the layer that holds the plane `across` = `at_m` metres, as large as the map's known cells.
 
     bounds: `voxel_map.bounds()`, if the caller has it already: it takes longer than the rest.
-    Raises StereovoxError where `across` is none of x, y, z, `at_m` is no number, or the map is empty.
+    Raises StereovoxError if `across` is none of x, y, z, `at_m` is no number, or the map is empty.
     """
     if across not in ACROSS:
         raise StereovoxError(f"layer across '{across}': name one of x, y, z")
@@ -69,7 +69,7 @@ def along_ray(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return what a ray meets: distance (N + 1,) in metres at which it enters each cell, and its end; log-odds (N,).
 
-    origin (3,) in metres, direction (3,) of any length but zero, world frame. Log-odds are 0 where nothing is known.
+    origin (3,) in metres, direction (3,) of any length but zero, world frame. Log-odds are 0 if nothing is known.
     """
     start, towards = np.asarray(origin, float), np.asarray(direction, float)
     if not np.linalg.norm(towards) > 0:

@@ -104,7 +104,7 @@ class PathCorrections:
         return mounts
 
     def _fixed(self, body: str, frame_id: str) -> Transform | None:
-        """Return T_body_frame (4, 4), None where it is not known or moves."""
+        """Return T_body_frame (4, 4), None if it is not known or moves."""
         tf = self._poses.tf
         if body == frame_id:
             return np.eye(4)
@@ -148,7 +148,7 @@ class JumpCorrections:
 def _by_path(
     data: bytes, topic: str, mounts: Table[str, Transform], config: Config, frames: Sequence[KeptFrame]
 ) -> dict[FrameKey, Transform]:
-    """Return the poses of frames that a path moves noticeably. Raises StereovoxError where it is of no use."""
+    """Return the poses of frames that a path moves noticeably. Raises StereovoxError if it is of no use."""
     try:
         stamps, numbers = read_path(Wire(data, cdr=True))
         _check_stamps(stamps)
@@ -166,7 +166,7 @@ def _by_path(
 
 
 def _check_stamps(stamps: NDArray[np.int64]) -> None:
-    """Raise StereovoxError where several poses have one stamp: which of them is that of the image?"""
+    """Raise StereovoxError if several poses have one stamp: which of them is that of the image?"""
     if len(np.unique(stamps)) < len(stamps):
         raise StereovoxError("several of its poses have the same stamp; they need those of their images: docs/ros2.md")
 

@@ -129,7 +129,7 @@ class SlamLocalization(Localization):
         return self._slam.grid()
 
     def finish(self) -> SlamResult | None:
-        """Return the polished map and track, None where no scan became part of them."""
+        """Return the polished map and track, None if no scan became part of them."""
         return self._slam.finish() if self._slam.keyframes else None
 
     def restart(self) -> None:

@@ -65,7 +65,7 @@ class LocationTopics:
 
     `/tf`: map -> odom, with each scan, dated `ros.tf_tolerance_s` ahead, as Nav2's AMCL does: who asks for the newest
     pose then need not extrapolate. Nothing while the place is not known, or another node publishes the same; and no
-    topic has what is old. late: returns why what has a stamp is too old, "" where it is not.
+    topic has what is old. late: returns why what has a stamp is too old, "" if it is not.
     """
 
     def __init__(self, node: Any, poses: LocalizedPoses, options: Options, late: Late = never_late):

@@ -62,7 +62,7 @@ class TransformPublisher:
 class MotionPublisher:
     """Publishes tracked poses, none that are old. node: rclpy's; with_tf: on /tf, too, unless another node does.
 
-    late: returns why what has a stamp is too old, "" where it is not.
+    late: returns why what has a stamp is too old, "" if it is not.
     """
 
     def __init__(self, node: Any, with_tf: bool, late: Late = never_late):

@@ -163,7 +163,7 @@ class LidarPoses(PoseSource):
 
 
 def pose_source(node: Any, config: Config, options: Options, late: Late = never_late) -> PoseSource:
-    """Return where poses come from. late: returns why what has a stamp is too old to be published, "" where it is not.
+    """Return where poses come from. late: returns why what has a stamp is too old to be published, "" if it is not.
 
     Raises StereovoxError, one line, for a bad map or start, MissingExtra for gtsam.
     """

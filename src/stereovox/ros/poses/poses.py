@@ -141,7 +141,7 @@ class LiveTf(Tf):
         edge.clear()
 
     def mover(self, target: str, source: str) -> LiveEdge | None:
-        """Return what moves next to `source`; None where nothing moves or connects them."""
+        """Return what moves next to `source`; None if nothing moves or connects them."""
         try:
             up, down = self._path(frame_name(target), frame_name(source))
         except FrameRefused:
@@ -164,7 +164,7 @@ class Pose(NamedTuple):
 
 
 class SensorPoses:
-    """Poses of a frame in the world as they come; raises FrameRefused where one would be extrapolated."""
+    """Poses of a frame in the world as they come; raises FrameRefused if one would be extrapolated."""
 
     def __init__(self, poses: PoseBuffer, frame_id: str):
         self._poses, self._frame_id = poses, frame_id
@@ -182,7 +182,7 @@ class SensorPoses:
         return pose.T_world_sensor
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, with one more at either end; None where there are fewer than two."""
+        """Return the poses of a stretch of time, with one more at either end; None if there are fewer than two."""
         mover, found = self._poses.mover(self._frame_id), dict[int, Transform]()
         for stamp_ns in mover.stamps(first_ns, last_ns) if mover else ():
             with suppress(FrameRefused):
@@ -246,14 +246,14 @@ class PoseBuffer:
         return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
 
     def mover(self, frame_id: str) -> LiveEdge | None:
-        """Return what moves a frame in the world; None where it is not known."""
+        """Return what moves a frame in the world; None if it is not known."""
         try:
             return self.tf.mover(self._world_of(frame_id), frame_id)
         except FrameRefused:
             return None
 
     def pace(self, frame_id: str) -> Pace | None:
-        """Return how the poses of a frame in the world arrive; None where it is not known."""
+        """Return how the poses of a frame in the world arrive; None if it is not known."""
         mover = self.mover(frame_id)
         return mover.pace if mover else None
 

@@ -75,7 +75,7 @@ def packed_transforms(stamp_ns: int, transforms: Iterable[tuple[str, str, Transf
 
 @cache
 def tf_message() -> Any | None:
-    """Return the class of `tf2_msgs/TFMessage`: the package's, else one for bytes alone; None where neither is there.
+    """Return the class of `tf2_msgs/TFMessage`: the package's, else one for bytes alone; None if neither is there.
 
     With the latter a publisher takes `packed_transforms`, and a subscription must be `raw=True`.
     """

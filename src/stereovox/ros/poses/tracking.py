@@ -80,7 +80,7 @@ class TrackedPoses(PoseBuffer):
     def mount(self, frame_id: str, stamp_ns: int) -> Transform:
         """Return T_body_sensor (4, 4), and decide at the first call which frame the body is.
 
-        Raises FrameRefused `no_pose` where the camera is not mounted on it.
+        Raises FrameRefused `no_pose` if the camera is not mounted on it.
         """
         robot = self._robot(frame_id)
         if not (self.body or robot) and self._base_needed:
@@ -126,7 +126,7 @@ class TrackedPoses(PoseBuffer):
         super()._add(one, fixed)
 
     def _robot(self, frame_id: str) -> str:
-        """Return the robot's frame, "" where the camera is not mounted on one."""
+        """Return the robot's frame, "" if the camera is not mounted on one."""
         base = self._base_of(frame_id)
         return base if base != frame_id or frame_id == self._base else ""
 
@@ -203,7 +203,7 @@ class TrackedDepthInput(DepthInput):
         return self._tracking.track(super().frame(data, where))
 
     def look_up(self, poses: PoseBuffer) -> PoseLookup:
-        """Return what tells how the camera is mounted."""
+        """Return what reports how the camera is mounted."""
         return self._tracking.mounted
 
     def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:

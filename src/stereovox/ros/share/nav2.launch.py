@@ -2,7 +2,7 @@
 # pyright: reportMissingImports=false
 """A mapping node and Nav2 that plans in its map: ros2 launch nav2.launch.py depth:=/camera/camera/depth/image_rect_raw
 
-Written beside nav2_params.yaml by `stereovox ros2 --write-nav2 FOLDER`. Nav2's own map_server and AMCL are not
+Written next to nav2_params.yaml by `stereovox ros2 --write-nav2 FOLDER`. Nav2's own map_server and AMCL are not
 started: with `poses:=MAP.yaml lidar:=/scan` stereovox serves the map and localises the robot in it; with `poses:=given`
 somebody else publishes map -> odom. Nav2's servers run in one container with `use_composition:=True`; the mapping node
 is a Python process, which no container can hold. Include this file in another one with the same arguments.

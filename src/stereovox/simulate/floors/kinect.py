@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor model of a Kinect: quantised disparity, noise, shadows beside edges, limits."""
+"""Sensor model of a Kinect: quantised disparity, noise, shadows next to edges, limits."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ class Kinect:
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
-        TOO_NEAR and TOO_FAR by what it measured, UNMATCHED in shadows and beside edges.
-        true_depth_m: (height, width) along the optical axis, inf where there is nothing. Same seed, same image.
+        TOO_NEAR and TOO_FAR by what it measured, UNMATCHED in shadows and next to edges.
+        true_depth_m: (height, width) along the optical axis, inf if there is nothing. Same seed, same image.
         """
         random = np.random.default_rng(seed)
         # of the full image: a smaller one is a picture of it, with the same noise

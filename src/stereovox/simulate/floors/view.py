@@ -41,7 +41,7 @@ def cast(
 def cast_along(
     segments: NDArray[np.float64], origin: ArrayLike, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf where none is."""
+    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf if none is."""
     start = segments[:, :2] - np.asarray(origin, float)
     along = segments[:, 2:] - segments[:, :2]
     x, y = directions[:, :1], directions[:, 1:]
@@ -74,7 +74,7 @@ def with_lids(
 
     grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera above the floor. A lid is an
     underside above the eye or a top below it. Not visible: lids that rest on another obstacle or carry one, and those
-    not beside a free cell. Nothing that is free in `grid` changes.
+    not next to a free cell. Nothing that is free in `grid` changes.
     """
     from scipy import ndimage
 
@@ -132,7 +132,7 @@ class LevelView:
         ahead, left = corners.T
         if ahead.max() <= 0:
             return range(0)
-        if ahead.min() <= 1e-3:  # beside the camera: its slopes turn over
+        if ahead.min() <= 1e-3:  # next to the camera: its slopes turn over
             return range(len(self._across))
         slopes = -left / ahead
         first, last = np.searchsorted(self._across, [slopes.min(), slopes.max()])

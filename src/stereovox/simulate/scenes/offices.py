@@ -141,7 +141,7 @@ def _waypoints(offices: int, visits: int, random: np.random.Generator) -> NDArra
 
 
 def _along(start: float, end: float, random: np.random.Generator) -> NDArray[np.float64]:
-    """Return waypoints (N, 3) in the corridor from one door to another; none where they are opposite."""
+    """Return waypoints (N, 3) in the corridor from one door to another; none if they are opposite."""
     ahead = np.sign(end - start)
     first, last = start + BEFORE * ahead, end - BEFORE * ahead
     middles = BAY * (np.arange(min(start, end) // BAY, max(start, end) // BAY + 1) + 0.5)

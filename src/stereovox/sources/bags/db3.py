@@ -42,7 +42,7 @@ class Db3File(BagFile):
         return self._index(topic)[0]
 
     def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        """Return message `i`; raises FrameRefused `unreadable` if the file is damaged."""
         try:
             key = int(self._index(topic)[1][i])
             rows = self._file.rows("SELECT data FROM messages WHERE id = ?", key)

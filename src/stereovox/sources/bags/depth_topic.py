@@ -85,7 +85,7 @@ class DepthTopic:
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
     """Return the depth images of `topic`, or of the only topic that has any.
 
-    Raises SourceError where there is no such topic, or none or several.
+    Raises SourceError if there is no such topic, or none or several.
     """
     for named in filter(None, (topic, info)):
         if named not in file.types:
@@ -111,7 +111,7 @@ def depth_topics(file: BagFile) -> list[str]:
 
 
 def first_picture(file: BagFile, topic: str, attempts: int = 3) -> Picture | None:
-    """Return the first readable image of a topic, None where none of the first few is."""
+    """Return the first readable image of a topic, None if none of the first few is."""
     for i in range(min(attempts, len(file.stamps(topic)))):
         try:
             return read_picture(file, topic, i, topic)
@@ -155,7 +155,7 @@ def find_camera(
 
     stream, sensor: prefixes of a RealSense stream (`/device_0/sensor_0/Depth_0`) and sensor, None and "" for others.
     Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None. Raises
-    SourceError where there is no camera, or no valid one.
+    SourceError if there is no camera, or no valid one.
     """
     where = [info] if info else _places(topic, stream)
     found = next((place for place in where if place in file.types), None)
@@ -189,7 +189,7 @@ def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) 
 
 
 class Metadata:
-    """Keys and values recorded at exactly the time of another topic's message; {} where there are none."""
+    """Keys and values recorded at exactly the time of another topic's message; {} if there are none."""
 
     def __init__(self, file: BagFile, topic: str):
         self._file, self._topic = file, topic

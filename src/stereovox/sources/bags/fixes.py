@@ -87,7 +87,7 @@ def _geocentric(fixes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _fix(wire: Wire) -> tuple[int, tuple[float, ...]]:
-    """Return time and fix of a message; raises ValueError where it has none."""
+    """Return time and fix of a message; raises ValueError if it has none."""
     stamp_ns, _ = wire.header()
     status, _ = wire.number("b"), wire.number("H")
     fix = wire.numbers("d", 3)

@@ -44,7 +44,7 @@ class FolderFile(BagFile):
         return self._of(topic)[:, 0]
 
     def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where its file is damaged."""
+        """Return message `i`; raises FrameRefused `unreadable` if its file is damaged."""
         _, part, k = self._of(topic)[i].tolist()
         return self._parts[part].read(topic, k)
 
@@ -112,7 +112,7 @@ def _numbered(folder: Path) -> list[str]:
 
 
 def _whole(folder: Path, name: str) -> Path:
-    """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError where it is not there."""
+    """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError if it is not there."""
     path = folder / name
     if path.suffix == ".zstd":
         if not os.path.isfile(path.with_suffix("")):

@@ -41,7 +41,7 @@ class Reading(NamedTuple):
 
 
 def read_imu(wire: Wire) -> Reading:
-    """Return what a `sensor_msgs/Imu` says; raises ValueError where it is too short."""
+    """Return what a `sensor_msgs/Imu` says; raises ValueError if it is too short."""
     stamp_ns, frame_id = wire.header()
     numbers = wire.numbers("d", 4 + 9 + 3 + 9 + 3 + 1)
     rate, force = numbers[13:16], numbers[25:28]
@@ -54,7 +54,7 @@ def read_imu(wire: Wire) -> Reading:
 def read_acceleration(wire: Wire) -> tuple[int, str, NDArray[np.float64]]:
     """Return time in nanoseconds, frame and acceleration (3,) in m/s^2 of a `sensor_msgs/Imu`.
 
-    Raises ValueError where it is too short, not finite, or says that it has no acceleration.
+    Raises ValueError if it is too short, not finite, or says that it has no acceleration.
     """
     found = read_imu(wire)
     if not np.isfinite(found.force).all():
@@ -65,7 +65,7 @@ def read_acceleration(wire: Wire) -> tuple[int, str, NDArray[np.float64]]:
 def up_by_gravity(file: BagFile, tf: Tf, world: str) -> NDArray[np.float64] | None:
     """Return the unit vector (3,) that points up in `world`.
 
-    None where no IMU's frame is connected with it by /tf, or the mean of the accelerations is not that of gravity.
+    None if no IMU's frame is connected with it by /tf, or the mean of the accelerations is not that of gravity.
     """
     for topic in sorted(topic for topic, kind in file.types.items() if kind == IMU):
         found = []
@@ -103,7 +103,7 @@ class Topic(NamedTuple):
 
 
 def read_readings(file: BagFile, tf: Tf | None, frame_id: str, topic: str = "") -> ImuReadings | None:
-    """Return the readings of the IMU in a bag; None where there is none.
+    """Return the readings of the IMU in a bag; None if missing.
 
     Where one topic has angular rates and another accelerations (RealSense: gyro and accel), these are put at the times
     of those.

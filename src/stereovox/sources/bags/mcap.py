@@ -74,7 +74,7 @@ class McapFile(BagFile):
         return self._of(topic)[:, 0]
 
     def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        """Return message `i`; raises FrameRefused `unreadable` if the file is damaged."""
         try:
             with self._lock:
                 time, chunk, start = self._of(topic)[i].tolist()
@@ -127,7 +127,7 @@ class McapFile(BagFile):
 
 
 class Summary:
-    """The index at the end of a file; raises ValueError where it is missing, damaged or incomplete."""
+    """The index at the end of a file; raises ValueError if it is missing, damaged or incomplete."""
 
     def __init__(self, file: McapBytes):
         self._file = file
@@ -186,7 +186,7 @@ class ScannedFile:
     """The messages found by scanning a file from its beginning, as far as it is intact.
 
     whole: intact bytes; complete: whether the file ends there as it should; damaged: chunks skipped. Raises SourceError
-    for more records than memory allows, MissingExtra where chunks cannot be decompressed.
+    for more records than memory allows, MissingExtra if chunks cannot be decompressed.
     """
 
     def __init__(self, file: McapBytes):
@@ -316,7 +316,7 @@ class McapBytes:
         return data
 
     def record(self, start: int) -> Record:
-        """Return the record at `start`; raises ValueError where the file ends before it does."""
+        """Return the record at `start`; raises ValueError if the file ends before it does."""
         return record(self.at(start, min(start + HEAD, self.size)), start, self.size)
 
     def fields(self, found: Record, kind: int) -> Wire:
@@ -402,7 +402,7 @@ def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
 
 
 def _summary(file: McapBytes) -> tuple[int, bytes]:
-    """Return start and records of the summary of a whole file; raises ValueError where there is none."""
+    """Return start and records of the summary of a whole file; raises ValueError if there is none."""
     tail = file.at(file.size - TAIL, file.size)
     if not tail.endswith(START):
         raise ValueError("the file is cut off")
@@ -418,7 +418,7 @@ def _summary(file: McapBytes) -> tuple[int, bytes]:
 
 
 def _records(data: bytes) -> Iterator[Record]:
-    """Yield the records of a chunk or summary; raises ValueError where they do not fill it."""
+    """Yield the records of a chunk or summary; raises ValueError if they do not fill it."""
     at = 0
     while at < len(data):
         found = record(data[at : at + HEAD], at, len(data))

@@ -25,7 +25,7 @@ POSE_TYPES = frozenset({"geometry_msgs/Transform", "nav_msgs/Odometry"} | {f"geo
 
 
 class Wire:
-    """A serialised message, read from front to back; raises ValueError where it is too short.
+    """A serialised message, read from front to back; raises ValueError if it is too short.
 
     cdr: ROS 2's encoding: four bytes of header, numbers aligned to their own size, text ends in a zero byte.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures in a recording that were taken with its depth images, by the same camera or one mounted beside it."""
+"""Pictures in a recording that were taken with its depth images, by the same camera or one mounted next to it."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class PhotoTopic:
         self._file, self._topic, self._stamps = file, topic, file.stamps(topic)
 
     def near(self, recorded_ns: int, stamp_ns: int) -> Photo | None:
-        """Return the picture that was recorded nearest to a depth image, None where none is near.
+        """Return the picture that was recorded nearest to a depth image, None if none is near.
 
-        Its `pixels` raise FrameRefused where its own time is not near `stamp_ns`, that of the depth image.
+        Its `pixels` raise FrameRefused if its own time is not near `stamp_ns`, that of the depth image.
         """
         after = int(np.searchsorted(self._stamps, recorded_ns))
         around = [k for k in (after - 1, after) if 0 <= k < len(self._stamps)]
@@ -76,9 +76,9 @@ class PhotoTopic:
 
 
 def find_photos(file: BagFile, depth: DepthTopic, transforms: Callable[[], Tf | None]) -> PhotoTopic | None:
-    """Return the pictures to which depth images are registered, else those of a camera that is fixed beside theirs.
+    """Return the pictures to which depth images are registered, else those of a camera that is fixed next to theirs.
 
-    None where there are none whose camera and place are known. Infrared images are left out.
+    None if missing whose camera and place are known. Infrared images are left out.
 
     transforms: reads those of the recording; called where they are needed.
     """
@@ -118,7 +118,7 @@ def pixels_of(picture: Picture, size: tuple[int, int], name: str) -> NDArray[np.
 
 
 def _is_photo(file: BagFile, topic: str) -> bool:
-    """Return whether a topic holds pictures whose camera is told beside them."""
+    """Return whether a topic holds pictures whose camera is reported next to them."""
     info = sibling(topic.removesuffix("/compressed"), "camera_info")
     if file.types[topic] not in (IMAGE, COMPRESSED) or INFRARED.search(topic) or file.types.get(info) != CAMERA_INFO:
         return False

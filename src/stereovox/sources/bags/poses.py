@@ -19,12 +19,12 @@ from stereovox.sources.poses.trajectory import transforms
 
 T265 = re.compile(r"(/device_\d+/sensor_\d+/Pose_\d+/pose)/transform/data")
 """A geometry_msgs/Transform without a time: that is in the metadata, with the confidence."""
-CURE = "put poses beside it in a camera pair (pair.toml), or add ?pose=fixed for a camera that stood still"
+CURE = "put poses next to it in a camera pair (pair.toml), or add ?pose=fixed for a camera that stood still"
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Poses as the file has them, in its axes; None, and the reason in one line, where there are none.
+    """Poses as the file has them, in its axes; None, and the reason in one line, if there are none.
 
     tracker: they are a T265's, in OpenGL axes; of_camera: the messages say that they are those of the depth camera;
     assumed: else, what is assumed about them.
@@ -40,7 +40,7 @@ class FoundPoses:
 def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: str = "") -> FoundPoses:
     """Return the poses of `topic`, else the camera's according to /tf, else those of the only topic that has any.
 
-    frame_id: frame of the depth images, "" to skip /tf. world_frame: see `tf.tf_poses`. Raises SourceError where the
+    frame_id: frame of the depth images, "" to skip /tf. world_frame: see `tf.tf_poses`. Raises SourceError if the
     named topic does not exist or has no poses, and where /tf does not know `world_frame`.
     """
     if topic:
@@ -60,7 +60,7 @@ def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: 
 
 
 def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
-    """Return the poses of `topic`; raises SourceError where there is no such topic or it has no poses."""
+    """Return the poses of `topic`; raises SourceError if there is no such topic or it has no poses."""
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in POSE_TYPES:

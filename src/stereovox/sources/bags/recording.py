@@ -77,7 +77,7 @@ class Bag(DepthSource):
 
     Realsense-viewer writes `.db3` since librealsense 2.57 and `.bag` before; both are recognised by their topics and
     tell camera, unit and baseline. In ordinary bags the depth topic has 16UC1 (millimetres), 32FC1 (metres) or
-    compressedDepth images, and `camera_info` beside it. Where there are several, `?depth=/topic` says which.
+    compressedDepth images, and `camera_info` next to it. Where there are several, `?depth=/topic` says which.
 
     The files are read message by message, not played back by pyrealsense2: that plays at its own pace, cannot go to
     frame number i, and a damaged file may end it together with the program. Checked: `.db3` against files that
@@ -133,11 +133,11 @@ class Bag(DepthSource):
 
     @cached_property
     def _tf(self) -> Tf | None:
-        """The transforms in the recording, None where there are none."""
+        """The transforms in the recording, None if missing."""
         return self._poses.poses.tf if isinstance(self._poses, TurnedTf) else read_tf(self._file)
 
     def gravity(self) -> NDArray[np.float64] | None:
-        """Return the unit vector (3,) that points up in the world of the poses by an IMU; None where nothing tells."""
+        """Return the unit vector (3,) that points up in the world of the poses by an IMU; None if nothing tells."""
         found = self._poses
         if not isinstance(found, TurnedTf) or found.world != "file":
             return None
@@ -150,7 +150,7 @@ class Bag(DepthSource):
         return read_readings(self._file, self._tf, self._depth.frame_id, self._imu)
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""
+        """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN if there is none."""
         i = range(len(self))[i]
         frame = depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
         if self._photos is not None and frame.depth.size:
@@ -247,7 +247,7 @@ def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
     """Return the poses in a `.bag` or `.db3`, for a camera pair; `where` may name the topic: `t265.bag?poses=/topic`.
 
     `axes` and `world` as in `read_tracker`; T_world_body of a T265 has its confidence.
-    Raises SourceError where there is none.
+    Raises SourceError if there is none.
     """
     path, options = parse(str(where))
     options = replace(options, pose="", world_frame="", axes=axes or options.axes, world=world or options.world)

@@ -89,7 +89,7 @@ def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: floa
 class PointCloud:
     """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point there.
 
-    times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None where the cloud does not say.
+    times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None if the cloud does not say.
     """
 
     stamp_ns: int

@@ -56,7 +56,7 @@ class Ros1File(BagFile):
         return np.array([entry.time for entry in self._entries[topic]], np.int64)
 
     def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where the bag is damaged."""
+        """Return message `i`; raises FrameRefused `unreadable` if the bag is damaged."""
         entry = self._entries[topic][i]
         try:
             with self._lock:

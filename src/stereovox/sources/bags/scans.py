@@ -30,7 +30,7 @@ MAX_ATTEMPTS = 5
 class ScanTopic:
     """Scans, or clouds, of one topic in the order in which they were recorded.
 
-    frame_id: frame of the first that can be read, "" where none says.
+    frame_id: frame of the first that can be read, "" if none says.
     """
 
     def __init__(self, file: BagFile, topic: str, range_max: float = 0.0):
@@ -51,7 +51,7 @@ class ScanTopic:
         return int(self._stamps[i])
 
     def read(self, i: int) -> LaserScan | PointCloud:
-        """Return scan `i`, with the time of recording where it has none; raises FrameRefused `unreadable`."""
+        """Return scan `i`, with the time of recording if it has none; raises FrameRefused `unreadable`."""
         wire = self._file.read(self.topic, i)
         try:
             message = read_point_cloud(wire) if self.is_cloud else read_laser_scan(wire, self._range_max)
@@ -66,7 +66,7 @@ def find_scans(
     """Return the scans of `topic`, else of the topic with most scans, else with most clouds, and notes.
 
     depth_frame: frame of the depth images; clouds in it are made of them, and are left alone. None: no scans.
-    Raises SourceError where the named topic does not exist or has no scans.
+    Raises SourceError if the named topic does not exist or has no scans.
     """
     if topic:
         check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
@@ -85,7 +85,7 @@ def find_scans(
 
 
 def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:
-    """Raise SourceError where there is no such topic, or it holds none of these kinds of messages."""
+    """Raise SourceError if there is no such topic, or it holds none of these kinds of messages."""
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in (kinds := tuple(kinds)):
@@ -98,7 +98,7 @@ def busiest_topic(file: BagFile, topics: list[str]) -> str:
 
 
 def frame_id_of(file: BagFile, topic: str) -> str:
-    """Return the frame that the header of the first readable message of a topic names, "" where none does."""
+    """Return the frame that the header of the first readable message of a topic names, "" if none does."""
     for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return frame_name(file.read(topic, i).header()[1])
@@ -111,7 +111,7 @@ def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str
     """Return the topic with the robot's odometry, "" if there is none, and notes.
 
     given: preferred unless ""; other: a topic to ignore. Of several the one with most messages counts. Raises
-    SourceError where the given one does not exist or is not odometry.
+    SourceError if the given one does not exist or is not odometry.
     """
     if given:
         check_topic(file, given, (ODOMETRY,), "odom")
@@ -126,7 +126,7 @@ def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str
 
 
 def first_odometry(file: BagFile, topic: str) -> StampedTransform | None:
-    """Return the first readable message, None where none of the first few is."""
+    """Return the first readable message, None if none of the first few is."""
     for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return read_odometry(file.read(topic, i))
@@ -139,7 +139,7 @@ def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
     """Return the poses of a topic as transforms of `child` in `parent`; unreadable messages and invalid poses leave
     gaps.
 
-    Raises SourceError where no pose can be read.
+    Raises SourceError if no pose can be read.
     """
     edge, recorded = Edge(parent, child, topic), file.stamps(topic)
     for i in range(len(recorded)):

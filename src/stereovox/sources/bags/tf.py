@@ -208,7 +208,7 @@ class Tf:
         return True
 
     def moving(self, target: str, source: str) -> bool:
-        """Return whether one frame was seen to move in the other; raises FrameRefused where they are not connected."""
+        """Return whether one frame was seen to move in the other; raises FrameRefused if they are not connected."""
         return any(edge.moves for part in self._path(frame_name(target), frame_name(source)) for edge in part)
 
     def root(self, frame: str) -> str:
@@ -284,7 +284,7 @@ def tf_topics(file: BagFile) -> list[str]:
 
 
 def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
-    """Return the transforms of a recording, None where it has no topic of them.
+    """Return the transforms of a recording, None if it has no topic of them.
 
     Those of a topic named `tf_static` are valid at all times. Unreadable messages are skipped and leave gaps.
     """
@@ -331,7 +331,7 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
     """Return the poses of frame `body` in `world`, or the reason, in one line, why there are none.
 
     world: "" for `map`, else `odom`, where it is connected with `body`, else the root of its tree if it moved there.
-    Raises SourceError where a given `world` is not connected with `body`.
+    Raises SourceError if a given `world` is not connected with `body`.
     """
     body, world = frame_name(body), frame_name(world)
     try:
@@ -343,7 +343,7 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
         if world:
             raise SourceError(f"{refused}; correct ?world_frame={world}") from None
         return str(refused)
-    return f"{tf.where}: tells how {body} is mounted on {name}, not where that was"
+    return f"{tf.where}: reports how {body} is mounted on {name}, not where that was"
 
 
 def _motion(numbers: NDArray[np.float64]) -> Transform:

@@ -26,7 +26,7 @@ def decompress(data: bytes | memoryview, compression: str, limit: int) -> bytes:
     """Return decompressed bytes; compression: `bz2`, `lz4`, `zstd`, or "" and `none` for none.
 
     Raises ValueError for data that is damaged, truncated, compressed otherwise, or exceeds `limit` or `max_unpacked`,
-    and MissingExtra where the library for it is not installed.
+    and MissingExtra if the library for it is not installed.
     """
     if compression in ("", "none"):
         return bytes(data)
@@ -59,7 +59,7 @@ def decompress_message(data: bytes, limit: int) -> bytes:
 def _declared_size(data: bytes | memoryview) -> int:
     zstd = _zstd()
     try:
-        return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it need not be told
+        return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it need not be reported
     except zstd.ZstdError as error:
         raise ValueError(f"cannot be unpacked: {error}") from None
 

@@ -78,7 +78,7 @@ class BagWriter:
             raise
 
     def complete(self) -> None:
-        """Complete the recording and put it at `path`; where that fails, it is for `leave` to say what there is."""
+        """Complete the recording and put it at `path`; if that fails, it is for `leave` to say what there is."""
         self._flush_fixed()
         self._file.finish()
 
@@ -87,7 +87,7 @@ class BagWriter:
         self._file.sync()
 
     def leave(self) -> str:
-        """End a recording that cannot be completed; return which file has what was written, nothing where none has."""
+        """End a recording that cannot be completed; return which file has what was written, nothing if none has."""
         return self._file.leave()
 
     def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
@@ -104,7 +104,7 @@ class BagWriter:
         *,
         compressed: bool = False,
     ) -> None:
-        """Write a depth image and, on `camera_info` beside it, its camera; the pose is not written.
+        """Write a depth image and, on `camera_info` next to it, its camera; the pose is not written.
 
         uint16 depth becomes 16UC1 millimetres, float depth 32FC1 metres (REP 118). compressed: whole millimetres as PNG
         on `<topic>/compressedDepth`. What a `sensor_msgs/CameraInfo` does not hold is lost: the baseline, a correction,
@@ -130,9 +130,9 @@ class BagWriter:
         topic: str = "/camera/color/image_raw",
         frame_id: str = "camera_color_optical_frame",
     ) -> None:
-        """Write the picture that was taken with a depth image, and its camera on `camera_info` beside it.
+        """Write the picture that was taken with a depth image, and its camera on `camera_info` next to it.
 
-        Where it is beside the depth camera is for `fixed` to write; the same `frame_id`: depth is registered to it.
+        Where it is next to the depth camera is for `fixed` to write; the same `frame_id`: depth is registered to it.
         """
         if frame.photo is None:
             raise SourceError(f"{self.path}: {frame.name or topic} has no picture; leave it out")
@@ -253,11 +253,11 @@ class BagWriter:
 
 
 class BagFileWriter:
-    """Serialises messages and writes them beside `path`; `finish` moves the whole recording there.
+    """Serialises messages and writes them next to `path`; `finish` moves the whole recording there.
 
     ros: 1 for a path that ends in `.bag`, else 2. store: rosbags' types of that ROS. packed: chunks of a `.bag` are
     packed with lz4, those of an `.mcap` and of a folder with zstd; `.db3` has no such thing.
-    Raises MissingExtra without rosbags, SourceError where the recording cannot be written.
+    Raises MissingExtra without rosbags, SourceError if the recording cannot be written.
     """
 
     def __init__(self, path: Path, packed: bool = True):
@@ -309,7 +309,7 @@ class BagFileWriter:
     def finish(self) -> None:
         """Complete the recording and move it into place; an older file of that name is replaced.
 
-        Where that fails, what was written is still beside `path`, until `abort`.
+        Where that fails, what was written is still next to `path`, until `abort`.
         """
         with self._one_line_errors():
             self._writer.close()

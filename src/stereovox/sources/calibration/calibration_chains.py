@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo calibrations as visual-inertial odometry keeps them: each camera beside its place on a body.
+"""Stereo calibrations as visual-inertial odometry keeps them: each camera next to its place on a body.
 
 Kalibr (also as OpenVINS writes it), sensor.yaml of EuRoC (also Kimera's), OKVIS, VINS-Fusion, ORB-SLAM3 and Basalt.
 In all of them `T_a_b` maps b into a, though names differ: Kalibr's T_cam_imu maps the body into the camera; T_imu_cam
@@ -68,7 +68,7 @@ def _kalibr(tables: Sequence[Table], folder: Path) -> StereoCalibration:
 
 
 def _kalibr_place(table: Table, name: str) -> Transform | None:
-    """Return T_body_cam (4, 4), None where the file has none; raises SourceError where both ways contradict."""
+    """Return T_body_cam (4, 4), None if the file has none; raises SourceError if both ways contradict."""
     camera = table[name]
     T_cam_imu, T_imu_cam = (rigid(camera[key], f"{name}.{key}") if key in camera else None for key in PLACES)
     if T_cam_imu is None:

@@ -99,7 +99,7 @@ def from_rectification(
     """Return the eyes of a rectification; the rectified frames differ by the baseline in the second's projection.
 
     lenses: of the left and the right eye. turns: (3, 3) each, raw into rectified coordinates. places: (3, 4) each, the
-    projections of rectified coordinates. Raises SourceError where these tell no baseline.
+    projections of rectified coordinates. Raises SourceError if these tell no baseline.
     """
     shifts = []
     for P, eye in zip(places, ("left", "right"), strict=True):
@@ -130,7 +130,7 @@ def lens_model(distortion: Any, what: str) -> str:
 
 
 def lens_of(model: str, intrinsics: Sequence[float], distortion: Any, size: Sequence[float], eye: str) -> Lens:
-    """Return a lens from fx fy cx cy and its coefficients; raises SourceError where it has too many of them."""
+    """Return a lens from fx fy cx cy and its coefficients; raises SourceError if it has too many of them."""
     k = numbers(distortion, f"{eye} distortion")
     most = MODELS[model]
     if any(k[most:]):
@@ -156,12 +156,12 @@ def rigid(value: Any, what: str) -> Transform:
 
 
 def first_present(table: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """Return the value of the first of `names` that the table has, None where it has none."""
+    """Return the value of the first of `names` that the table has, None if it has none."""
     return next((table[name] for name in names if name in table), None)
 
 
 def named(table: Mapping[str, Any], names: Sequence[str], whose: str) -> Any:
-    """Return the value of the first of `names` that the table has; raises SourceError where it has none."""
+    """Return the value of the first of `names` that the table has; raises SourceError if it has none."""
     found = first_present(table, names)
     if found is None:
         raise SourceError(f"the {whose} {names[0]} is missing; give the file as the calibration wrote it")
@@ -174,7 +174,7 @@ def data_of(value: Any) -> Any:
 
 
 def matrix(value: Any, what: str, rows: int, columns: int) -> NDArray[np.float64]:
-    """Return a (rows, columns) matrix; raises SourceError where it has another number of finite numbers."""
+    """Return a (rows, columns) matrix; raises SourceError if it has another number of finite numbers."""
     return np.array(numbers(data_of(value), what, rows * columns)).reshape(rows, columns)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera of a recording: `camera.toml`, or the small text files beside the images."""
+"""The camera of a recording: `camera.toml`, or the small text files next to the images."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class FoundCamera(NamedTuple):
     """Camera of a recording, and what its file says besides.
 
     notes: what was assumed, used or ignored. mirrored: its file has a negative fy, so the second axis of the camera of
-    its poses points up (see `rgbd.folder`). depth_scale: metres per unit of depth images, None where no file says.
+    its poses points up (see `rgbd.folder`). depth_scale: metres per unit of depth images, None if no file says.
     """
 
     camera: PinholeCamera
@@ -89,7 +89,7 @@ def find_camera(
     The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
     the `names`, in the order of `folders`, each as `read_camera_numbers` reads it. Without one, images get the
     `default` of their size. `baseline` in metres applies where the file has none. Raises SourceError for a bad file, or
-    where there is none and the images have another size.
+    if there is none and the images have another size.
     """
     places = [folders[0] / FILE, *(folder / name for folder in folders for name in names)]
     found = [path for path in dict.fromkeys(places) if os.path.isfile(path)]  # Path.is_file may raise

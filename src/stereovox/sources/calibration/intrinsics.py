@@ -25,7 +25,7 @@ TEXT_NAMES = (
 )  # fmt: skip
 YAML_NAMES = ("camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "camera_info.yaml", "intrinsics.yaml")
 NAMES = (*TEXT_NAMES, *JSON_NAMES, *YAML_NAMES)
-"""Names by which a camera is looked for beside the images, in this order."""
+"""Names by which a camera is looked for next to the images, in this order."""
 KEYS = {
     "fx": ("fx", "fl_x", "focal_x", "focal_length_x"),
     "fy": ("fy", "fl_y", "focal_y", "focal_length_y"),
@@ -45,8 +45,8 @@ class CameraNumbers(NamedTuple):
     """Numbers of a camera in a file of another program.
 
     intrinsics: fx, fy, cx, cy in pixels; fy is negative where the image's second axis points up (ICL-NUIM).
-    size: (width, height) in pixels, None where the file does not say. depth_scale: metres per unit of its depth images,
-    None where the file does not say.
+    size: (width, height) in pixels, None if the file does not say. depth_scale: metres per unit of its depth images,
+    None if the file does not say.
     """
 
     intrinsics: Intrinsics

@@ -43,7 +43,7 @@ class Options(LidarOptions):
     """Options of `LidarOptions`, and:
 
     poses: file of the poses, of any form (see `rgbd.pose_files`), in place of the folder's own. axes: those of the
-    posed body where it is not the lidar's (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds a
+    posed body if it is not the lidar's (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds a
     second, where they have no times.
     """
 
@@ -68,7 +68,7 @@ class CloudFolder(CloudSource):
     Times: of the files' names, where these are seconds with a fraction or nanoseconds; else lines of seconds in
         `times.txt`; else 10 clouds a second, which a note tells.
     Faults: `unreadable`, `no_pose`, `bad_pose_file`.
-    Raises SourceError where there is no cloud, or what is said of times and poses does not fit.
+    Raises SourceError if there is no cloud, or what is said of times and poses does not fit.
     """
 
     layout = "a folder of clouds (.pcd, .ply, .bin) with poses of the lidar (poses.txt)"

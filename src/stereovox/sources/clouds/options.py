@@ -62,7 +62,7 @@ def options_of(where: str, start: int, kind: type[OptionsT]) -> tuple[OptionsT, 
 
 
 def no_others(where: str, others: dict[str, str], kind: type[LidarOptions]) -> None:
-    """Raise SourceError where there are options that a class does not know."""
+    """Raise SourceError if there are options that a class does not know."""
     try:
         parameters.typed(others, {field.name: field.default for field in fields(kind)})
     except SourceError as error:
@@ -81,7 +81,7 @@ class CloudSource(Source, Protocol):
     camera: Any = FORWARD
 
     def cloud(self, i: int) -> Cloud:
-        """Return cloud number `i`, from 0; raises FrameRefused where it cannot be used."""
+        """Return cloud number `i`, from 0; raises FrameRefused if it cannot be used."""
         ...
 
     def stamp_ns(self, i: int) -> int:

@@ -30,7 +30,7 @@ class CameraPoses(Protocol):
     """Poses of camera 0 for each frame; see `kitti.poses`."""
 
     def at(self, i: int) -> Transform:
-        """Return T_world_cam0 (4, 4); raises FrameRefused where there is none."""
+        """Return T_world_cam0 (4, 4); raises FrameRefused if there is none."""
         ...
 
 
@@ -84,11 +84,11 @@ class KittiSource(Source, ABC):
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused where there is none."""
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if there is none."""
         return self.viewpoint(i).T_world_camera
 
     def viewpoint(self, i: int) -> Viewpoint:
-        """Return the rectified left camera of frame `i`, its pose and time; FrameRefused where there is no pose."""
+        """Return the rectified left camera of frame `i`, its pose and time; FrameRefused if there is no pose."""
         i = range(len(self))[i]
         T_cam0_left = inverse(self.calibration_of(i).offset_of(self.eyes[0]))
         return Viewpoint(self.pair(i).camera.middle, self.poses.at(i) @ T_cam0_left, self.stamp_ns(i))
@@ -112,12 +112,12 @@ class KittiSource(Source, ABC):
         return ()
 
     def moving(self, i: int) -> NDArray[np.bool_] | None:
-        """Return the mask of moving pixels, None where the recording has none."""
+        """Return the mask of moving pixels, None if the recording has none."""
         range(len(self))[i]
         return None
 
     def _size(self) -> tuple[int, int]:
-        """Return (width, height) of the left images; raises SourceError where none can be read."""
+        """Return (width, height) of the left images; raises SourceError if none can be read."""
         paths = [self.images(i)[0] for i in range(len(self))]
         size = common_size(paths, kinds=PICTURE_KINDS)
         if size is None:
@@ -127,7 +127,7 @@ class KittiSource(Source, ABC):
 
 
 def time_lines(path: Path, whose: str) -> list[str]:
-    """Return the stripped lines of a file of times; raises SourceError where there is none."""
+    """Return the stripped lines of a file of times; raises SourceError if there is none."""
     try:
         lines = read_text(path, MAX_LIST, "replace").rstrip().splitlines()
     except OSError as error:

@@ -28,7 +28,7 @@ class KittiCalibration:
     """The rectified cameras 0 to 3 and where lidar and inertial unit sit.
 
     Camera 0, rectified, is the frame of reference. projections: (3, 4) by camera number, pixels from points in
-    rectified camera 0. T_cam0_velo, T_velo_imu: (4, 4), None where the recording does not tell.
+    rectified camera 0. T_cam0_velo, T_velo_imu: (4, 4), None if the recording does not tell.
     where: file or folder it was read from, for messages.
     """
 
@@ -40,7 +40,7 @@ class KittiCalibration:
     def camera(self, left: int, right: int, size: tuple[int, int]) -> PinholeCamera:
         """Return the rectified left camera of a pair for images of (width, height), with the pair's baseline.
 
-        Raises SourceError where there is no such pair or its numbers make none.
+        Raises SourceError if there is no such pair or its numbers make none.
         """
         P = self._projection(left)
         baseline = (self.offset_of(left) - self.offset_of(right))[0, 3]
@@ -99,7 +99,7 @@ def read_calibration(path: Path) -> KittiCalibration:
 def read_values(path: Path) -> dict[str, list[float]]:
     """Return the numbers behind each name; the colon may be missing, and what is no number (a date) is left out.
 
-    Raises SourceError where the file cannot be read or holds nothing of the kind.
+    Raises SourceError if the file cannot be read or holds nothing of the kind.
     """
     try:
         lines = read_text(path).splitlines()
@@ -143,7 +143,7 @@ def _rigid(values: Values, name: str, path: Path) -> Transform:
 
 
 def _rigid_file(path: Path) -> Transform | None:
-    """Return the motion in a file with lines `R` and `T`, None where there is no such file."""
+    """Return the motion in a file with lines `R` and `T`, None if there is no such file."""
     if not os.path.isfile(path):
         return None
     values = read_values(path)

@@ -34,10 +34,10 @@ class KittiOdometry(KittiSource):
 
     where: the folder, or with options `sequences/00?camera=colour&poses=FILE`:
         camera: `grey` or `colour`; without it grey where there are such images.
-        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it `poses/00.txt` beside `sequences`,
-            which the benchmark publishes for 00 to 10 only.
+        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it `poses/00.txt` next to
+            `sequences`, which the benchmark publishes for 00 to 10 only.
         axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
-        fps: frames a second where there is no times.txt, 10 without it.
+        fps: frames a second if there is no times.txt, 10 without it.
     posed: without it poses are not looked for, and are NaN.
     Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are untwisted there.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
@@ -100,7 +100,7 @@ class KittiOdometry(KittiSource):
         return read_named_poses(path, self._stamps, axes, inverted)
 
     def _times(self, fps: float) -> list[int]:
-        """Return the times of all frames in nanoseconds; from numbers where there is no list or `fps` is given."""
+        """Return the times of all frames in nanoseconds; from numbers if there is no list or `fps` is given."""
         if not fps and os.path.isfile(self.folder / TIMES):
             return _stamps(self.folder / TIMES)
         folder = self.folder / f"image_{self.eyes[0]}"

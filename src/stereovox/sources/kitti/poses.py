@@ -35,7 +35,7 @@ class FramePoses:
 
     T_any_cam0: for each frame (4, 4) in any world, or what is wrong with it in one line. World of what `at` returns:
     z up, x forward, y left and origin at camera 0 of the first frame that has a pose.
-    Raises SourceError where not one frame has a pose.
+    Raises SourceError if not one frame has a pose.
     """
 
     def __init__(self, T_any_cam0: Sequence[Transform | str], where: str):
@@ -82,7 +82,7 @@ def read_named_poses(path: Path, stamps_ns: Sequence[int], axes: str = "", inver
     """Return the poses of camera 0 in a file or folder that an option names, one for each of the times `stamps_ns`.
 
     Twelve numbers a line are read as `read_pose_file` does, any other form as `poses_of_images`. axes: of the posed
-    camera, `optical` where it is empty. inverted: they map the world into the camera. Raises SourceError.
+    camera, `optical` if it is empty. inverted: they map the world into the camera. Raises SourceError.
     """
     if not os.path.isdir(path) and _is_kitti(path):
         found = [_pose(line, f"{path}:{n}") for n, line in enumerate(_frame_lines(path, len(stamps_ns)), 1)]
@@ -195,7 +195,7 @@ def _packet(line: str, where: str) -> NDArray[np.float64] | str:
 
 
 def _floats(line: str) -> NDArray[np.float64]:
-    """Return the numbers of a line; none where one of its words is no number."""
+    """Return the numbers of a line; none if one of its words is no number."""
     try:
         return np.array([float(word) for word in line.split()])
     except ValueError:

@@ -46,7 +46,7 @@ class KittiRaw(KittiSource):
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
-    layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt beside the drive)"
+    layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt next to the drive)"
 
     parts = (
         Part(("image_00/data", "image_02/data"), "left images (image_00/data)"),
@@ -92,9 +92,9 @@ class KittiRaw(KittiSource):
         return self.folder / "velodyne_points" / "data" / f"{i:010d}.bin"
 
     def imu(self) -> ImuReadings | None:
-        """Return angular rates and accelerations of oxts; None where there are none, or nothing says how it is mounted.
+        """Return angular rates and accelerations of oxts; None if missing, or nothing says how it is mounted.
 
-        Raises SourceError where they are damaged.
+        Raises SourceError if they are damaged.
         """
         data, times, c = self.folder / OXTS / "data", self.folder / OXTS / "timestamps.txt", self.calibration
         if self._imu == "off" or not (os.path.isdir(data) and os.path.isfile(times)):

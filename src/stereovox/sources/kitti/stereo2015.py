@@ -29,10 +29,10 @@ class KittiStereo2015(KittiSource):
     """A folder `training` with image_2/000000_10.png and image_3; of each scene only this first pair is used.
 
     Calibration: `calib/000000.txt` (object data style), or calib_cam_to_cam/000000.txt with calib_velo_to_cam and
-    calib_imu_to_velo beside it; scenes may differ, in image size too, so `camera` is only that of the first one.
+    calib_imu_to_velo next to it; scenes may differ, in image size too, so `camera` is only that of the first one.
     Scans: `velodyne/000000.bin`, which the benchmark does not have but some collections add. Moving objects: obj_map.
     World: camera 0 of each scene, upright; there are no poses. Time: one second for each scene number.
-    Faults: see `KittiSource`. Raises SourceError where a calibration is missing or bad.
+    Faults: see `KittiSource`. Raises SourceError if a calibration is missing or bad.
     """
 
     layout = "KITTI stereo 2015 scenes (training with image_2/000000_10.png and image_3)"

@@ -85,7 +85,7 @@ class KittiTracking(KittiSource):
         return self.folder / "velodyne" / self.sequence / f"{i:06d}.bin"
 
     def boxes(self, i: int) -> tuple[Box, ...]:
-        """Return the annotated objects of frame `i`; raises FrameRefused where there is no pose."""
+        """Return the annotated objects of frame `i`; raises FrameRefused if there is no pose."""
         i = range(len(self))[i]
         return self._labels.boxes(i, self.poses.at(i))
 

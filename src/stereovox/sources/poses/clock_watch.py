@@ -53,7 +53,7 @@ class Delays:
             self._least.append((arrived_ns, delay_ns))
 
     def least_ns(self, now_ns: int) -> int | None:
-        """Return the least delay of the last second; None where nothing came within it."""
+        """Return the least delay of the last second; None if nothing came within it."""
         with self._lock:
             while self._least and now_ns - self._least[0][0] > WINDOW_NS:
                 self._least.popleft()
@@ -76,7 +76,7 @@ class ClockDoubt:
         start: Whether it was so from the first image on.
         announced: Whether a stamp went back.
         became: OPEN, GONE, LATE or CLOCK.
-        told: Whether the user was told.
+        told: Whether the user was reported.
     """
 
     off_ns: int

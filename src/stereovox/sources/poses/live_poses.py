@@ -112,8 +112,8 @@ class LivePoses:
             The pose of that very time, else the one between its neighbours.
 
         Raises:
-            FrameRefused: `no_pose` where a neighbour did not come in time or is 0.1 s or more away, `pose_jump` where
-                the body jumped between them, `bad_pose_file` where a neighbour cannot be used.
+            FrameRefused: `no_pose` if a neighbour did not come in time or is 0.1 s or more away, `pose_jump` if
+                the body jumped between them, `bad_pose_file` if a neighbour cannot be used.
         """
         stamp_ns = int(stamp_ns)
         with self._change:
@@ -139,7 +139,7 @@ class LivePoses:
         return found
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, with one more at either end; None where there are fewer than two."""
+        """Return the poses of a stretch of time, with one more at either end; None if there are fewer than two."""
         with self._change:
             begin = max(bisect_left(self._stamps, first_ns) - 1, 0)
             stamps = self._stamps[begin : bisect_left(self._stamps, last_ns) + 1]
@@ -176,7 +176,7 @@ class LivePoses:
 
     @property
     def newest(self) -> tuple[int, Transform] | None:
-        """Stamp and T_world_body (4, 4) of the newest pose, NaN where it cannot be used; None without any."""
+        """Stamp and T_world_body (4, 4) of the newest pose, NaN if it cannot be used; None without any."""
         with self._change:
             return (self._stamps[-1], self._poses[self._stamps[-1]]) if self._stamps else None
 

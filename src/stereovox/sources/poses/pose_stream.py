@@ -77,7 +77,7 @@ class PoseStream:
             self.poses.end("the stream ended")
         except SourceError as error:
             self._fail(str(error))
-        except Exception as error:  # a device that breaks must be told, not vanish with its thread
+        except Exception as error:  # a device that breaks must be reported, not vanish with its thread
             self._fail(f"{self.name}: {type(error).__name__}: {error}")
 
     def _fail(self, why: str) -> None:
@@ -195,7 +195,7 @@ class T265(PoseStream):
     """A connected tracking camera, `t265` or `t265:SERIAL`, whose body is the tracker, looking ahead.
 
     Poses below medium confidence cannot be used. context: as for `RealSense`.
-    Raises MissingExtra without pyrealsense2; SourceError where none is connected, as with pyrealsense2 2.55 and later,
+    Raises MissingExtra without pyrealsense2; SourceError if none is connected, as with pyrealsense2 2.55 and later,
     which no longer know it.
     """
 
@@ -261,7 +261,7 @@ class T265(PoseStream):
 
 
 def read_line(text: str) -> tuple[int, Transform, float]:
-    """Return stamp in nanoseconds, pose (4, 4) and confidence (3 where none is told) of a line.
+    """Return stamp in nanoseconds, pose (4, 4) and confidence (3 if none is reported) of a line.
 
     Raises ValueError for anything but `stamp tx ty tz qx qy qz qw [confidence]`.
     """

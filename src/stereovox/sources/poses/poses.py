@@ -23,11 +23,11 @@ class Poses:
     stamps_ns: (N,) int64 nanoseconds, in any order; of several with one stamp the first counts.
     T_world_body: (N, 4, 4) float64, in the same order. NaN marks a pose that cannot be used: it is remembered, and
         whatever needs it is refused.
-    confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None where it is not known.
+    confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None if it is not known.
     where: what the poses came from, for messages: a file or topic.
     faults: why poses cannot be used, by stamp; one line each with the cure.
     repeated: how many poses were left out, since another one with their stamp came before.
-    Raises SourceError where there is no pose at all or the arrays do not fit together.
+    Raises SourceError if there is no pose at all or the arrays do not fit together.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class Poses:
         """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between the neighbours before and after.
 
         Straight line in position, constant turn rate in rotation.
-        Raises FrameRefused: `no_pose` where one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
-        where a neighbour cannot be used.
+        Raises FrameRefused: `no_pose` if one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
+        if a neighbour cannot be used.
         """
         before, after = self.neighbours(stamp_ns)
         if before == after:
@@ -72,7 +72,7 @@ class Poses:
     def neighbours(self, stamp_ns: int) -> tuple[int, int]:
         """Return the numbers of the poses before and after `stamp_ns`, twice the same where one has that very time.
 
-        Raises FrameRefused `no_pose` where one of them is missing or 0.1 s or more away.
+        Raises FrameRefused `no_pose` if one of them is missing or 0.1 s or more away.
         """
         stamp_ns = int(stamp_ns)
         after = bisect_left(self._stamps, stamp_ns)

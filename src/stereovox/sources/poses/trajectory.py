@@ -30,7 +30,7 @@ class Trajectory(Poses):
 
     Lines may be in any order; of several with one stamp the first counts. A line that has a stamp but no usable pose
     is remembered, and whatever needs it is refused.
-    Raises SourceError with file and line where a stamp is unreadable, or where there is no line at all.
+    Raises SourceError with file and line where a stamp is unreadable, or if there is no line at all.
     """
 
     def __init__(self, path: Path):
@@ -42,7 +42,7 @@ class Trajectory(Poses):
 def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[np.float64], whose: str) -> None:
     """Write poses (N, 4, 4) as lines of the TUM format, all or nothing; `whose`: what is posed, for the first line.
 
-    Raises MapFileError where the file cannot be written; an older one is then still there.
+    Raises MapFileError if the file cannot be written; an older one is then still there.
     """
     from scipy.spatial.transform import Rotation
 
@@ -55,7 +55,7 @@ def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[
 
 
 def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
-    """Return the lines of a file of poses in order of time; raises SourceError where there is none or no stamp."""
+    """Return the lines of a file of poses in order of time; raises SourceError if there is none or no stamp."""
     lines = sorted(stamped_lines(path), key=lambda line: line[0])
     if not lines:
         raise SourceError(f"{path}: holds no pose; write lines '{wanted}'")
@@ -107,7 +107,7 @@ def stamped_lines(path: Path) -> list[StampedLine]:
 
 
 def inside(name: str, where: str) -> str:
-    """Return the name of a file that a line of a list gives; raises SourceError where it leads out of the folder."""
+    """Return the name of a file that a line of a list gives; raises SourceError if it leads out of the folder."""
     if os.path.isabs(name) or ".." in PurePath(name).parts or "\0" in name:
         raise SourceError(f"{where}: '{name}' leads out of the recording's folder; put the file there and name it so")
     return name

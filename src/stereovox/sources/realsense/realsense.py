@@ -72,7 +72,7 @@ class RealSense(Stream):
     Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
     `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
     and pyrealsense2 2.55 and later no longer supports the T265.
-    Raises MissingExtra without pyrealsense2; SourceError where no camera or not the right one is connected,
+    Raises MissingExtra without pyrealsense2; SourceError if no camera or not the right one is connected,
     for modes and settings that it does not have, and while frames are taken, where none came for 5 s.
     """
 
@@ -97,7 +97,7 @@ class RealSense(Stream):
         self._photos = self._beside("colour camera", self.options.photo, find_photos)
 
     def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any], T | None]) -> T | None:
-        """Return a sensor that helps to track, None where there is none, or the camera does not say where it is."""
+        """Return a sensor that helps to track, None if missing, or the camera does not say where it is."""
         if self.posed or option == "off":
             return None
         try:
@@ -160,7 +160,7 @@ class RealSense(Stream):
         if self.options.pose == "fixed":
             return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name, sensor=self.name)
         detail = f"{name}: the camera does not know where it is; add ?pose=fixed if it stands still, else record it"
-        detail += " and put poses beside the recording in a camera pair (pair.toml)"
+        detail += " and put poses next to the recording in a camera pair (pair.toml)"
         return Frame(
             depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
             fault="no_pose", fault_detail=detail, photo=self._photos and self._photos.near(stamp_ns),

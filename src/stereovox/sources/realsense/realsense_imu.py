@@ -38,7 +38,7 @@ class MotionSensor(SideSensor):
 
 
 def find_motion(rs: Any, device: Any, depth_profile: Any, name: str) -> MotionSensor | None:
-    """Return the motion sensor of a camera, None where it has no gyroscope; raises RuntimeError."""
+    """Return the motion sensor of a camera, None if it has no gyroscope; raises RuntimeError."""
     for sensor in device.query_sensors():
         found: dict[str, Any] = {}
         for profile in sensor.get_stream_profiles():

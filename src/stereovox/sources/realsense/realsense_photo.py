@@ -68,7 +68,7 @@ class PhotoSensor(SideSensor):
     def near(self, stamp_ns: int) -> Photo:
         """Return the picture nearest to a depth image of that time, which is read once it is needed.
 
-        Its `pixels` wait for 15 ms where only earlier ones have come; they raise FrameRefused where none is within
+        Its `pixels` wait for 15 ms where only earlier ones have come; they raise FrameRefused if none is within
         20 ms, or is kept no more.
         """
         return Photo(cache(partial(self._pixels, stamp_ns)), self.camera, self._T)
@@ -102,9 +102,9 @@ class PhotoSensor(SideSensor):
 
 
 def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
-    """Return the colour camera beside a depth camera, in a mode of its rate; None where there is none.
+    """Return the colour camera next to a depth camera, in a mode of its rate; None if missing.
 
-    Raises RuntimeError and StereovoxError where the camera does not say how it sees or where it is.
+    Raises RuntimeError and StereovoxError if the camera does not say how it sees or where it is.
     """
     modes = [
         (sensor, profile.as_video_stream_profile())
@@ -125,5 +125,5 @@ def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
 
 
 def _form(rs: Any, profile: Any) -> str:
-    """Return the name of a mode's form, nothing where no picture can be made of it."""
+    """Return the name of a mode's form, nothing if no picture can be made of it."""
     return next((name for name in GREY_FROM if profile.format() == getattr(rs.format, name)), "")

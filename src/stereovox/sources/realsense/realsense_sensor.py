@@ -13,7 +13,7 @@ from stereovox.geometry.se3 import Transform
 
 
 class SideSensor:
-    """A sensor beside the depth camera, without which tracking goes on.
+    """A sensor next to the depth camera, without which tracking goes on.
 
     Args:
         rs: The library.

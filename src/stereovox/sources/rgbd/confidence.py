@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of confidence beside depth images, as ARKit gives them: 0 low, 1 medium, 2 high."""
+"""Images of confidence next to depth images, as ARKit gives them: 0 low, 1 medium, 2 high."""
 
 from __future__ import annotations
 

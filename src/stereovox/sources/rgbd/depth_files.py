@@ -192,7 +192,7 @@ def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
 
 
 def _tiff_pixels(content: bytes) -> int:
-    """Return width times height times samples by the first directory of a TIFF; 0 where it cannot be read."""
+    """Return width times height times samples by the first directory of a TIFF; 0 if it cannot be read."""
     order: Literal["little", "big"] = "little" if content.startswith(b"II") else "big"
     start = int.from_bytes(content[4:8], order)
     told = {256: 0, 257: 0, 277: 1}  # width, height, samples
@@ -204,7 +204,7 @@ def _tiff_pixels(content: bytes) -> int:
 
 
 def _check_pixels(path: Path, pixels: int) -> None:
-    """Raise FrameRefused where a header claims no pixels, or more than are believed."""
+    """Raise FrameRefused if a header claims no pixels, or more than are believed."""
     if not 0 < pixels <= MAX_PIXELS:
         raise FrameRefused("unreadable", f"{path}: its header is damaged or tells of {pixels} pixels; remove it")
 

@@ -47,7 +47,7 @@ STILL = 1e6
 WORST = 0.06
 """Largest median difference of depths, relative, with which images fit together at all."""
 LIKELY_M = 0.25, 40.0
-"""Median depth in metres of a scene that a unit is plausible for, where there is nothing else to go by."""
+"""Median depth in metres of a scene that a unit is plausible for, if there is nothing else to go by."""
 
 
 class DepthUnit(NamedTuple):
@@ -141,7 +141,7 @@ def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int],
 
 
 def _second(first: int, count: int, pose: Callable[[int], Transform]) -> int | None:
-    """Return the number of the next image that was taken far enough away, None where there is none."""
+    """Return the number of the next image that was taken far enough away, None if missing."""
     best, farthest = None, 0.1 * MOVED_M
     try:
         start = _numbers(pose(first))
@@ -208,7 +208,7 @@ def is_likely(pairs: Sequence[tuple[View, View]], unit: float) -> bool:
 
 
 def _middle(pairs: Sequence[tuple[View, View]], unit: float) -> float:
-    """Return the median depth in metres, NaN where there is none."""
+    """Return the median depth in metres, NaN if there is none."""
     depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
     return float(np.median(np.concatenate(depths))) * unit if any(map(len, depths)) else np.nan
 

@@ -98,12 +98,12 @@ def folder_options(where: str | os.PathLike[str]) -> tuple[Path, FolderOptions]:
 class DepthFolder(DepthSource, ABC):
     """Frames from depth images, one file each; an unusable file becomes a frame with a `fault`.
 
-    A layout lists its images and reads its poses; what it does not say otherwise is looked for: the camera beside the
+    A layout lists its images and reads its poses; what it does not say otherwise is looked for: the camera next to the
     images, the unit by convention and by how images agree with each other (see `depth_unit`). The options behind the
     folder's name come before all of it (see `FolderOptions`).
-    Pixels hold 0, 65535, NaN or infinity where there is no value, without a reason: all are UNKNOWN, none clears.
+    Pixels hold 0, 65535, NaN or infinity if there is no value, without a reason: all are UNKNOWN, none clears.
     Faults: those of `read_depth`, and `no_pose` and `bad_pose_file`.
-    Raises SourceError where there is no readable image, no camera or no poses.
+    Raises SourceError if there is no readable image, no camera or no poses.
 
     Attributes:
         depth_scale: Metres per unit of integer images, by convention; floats are metres.
@@ -162,11 +162,11 @@ class DepthFolder(DepthSource, ABC):
         return None
 
     def numbers(self) -> list[int]:
-        """Return the numbers of the images, those in the names of their files; -1 where there is none."""
+        """Return the numbers of the images, those in the names of their files; -1 if there is none."""
         return [number_in(image.path.name)[0] for image in self._images]
 
     def size(self) -> tuple[int, int]:
-        """Return (width, height) of the images; raises SourceError where none can be read."""
+        """Return (width, height) of the images; raises SourceError if none can be read."""
         size = common_depth_size([image.path for image in self._images])
         if isinstance(size, str):
             raise SourceError(f"none of the {len(self)} depth images of {self.folder} can be read: {size}")
@@ -177,7 +177,7 @@ class DepthFolder(DepthSource, ABC):
         return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return pictures to which the depth images are registered, in any order; [] where there are none."""
+        """Return pictures to which the depth images are registered, in any order; [] if there are none."""
         return []
 
     def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
@@ -191,7 +191,7 @@ class DepthFolder(DepthSource, ABC):
 
     @cached_property
     def _photos(self) -> list[Path | None]:
-        """The picture of each depth image: the nearest in time; None where none is near."""
+        """The picture of each depth image: the nearest in time; None if none is near."""
         photos = self._listed_photos
         found = nearest_in_time([i.stamp_ns for i in self._images], [p.stamp_ns for p in photos], PHOTO_NS)
         return [None if k is None else photos[k].path for k in found]
@@ -205,7 +205,7 @@ class DepthFolder(DepthSource, ABC):
 
     @cached_property
     def _no_photos(self) -> str:
-        """Why not one of the pictures that are there can be used; "" where one can, and where there are none."""
+        """Why not one of the pictures that are there can be used; "" if one can, and if there are none."""
         if not self._listed_photos or self._photo_camera[0] is not None:
             return ""
         path = next(filter(None, self._photos), None)
@@ -217,7 +217,7 @@ class DepthFolder(DepthSource, ABC):
         raise FrameRefused("no_photo", self._no_photos)
 
     def photo(self, i: int) -> Photo | None:
-        """Return the picture that was taken with frame `i` (0 to len - 1), None where there is none.
+        """Return the picture that was taken with frame `i` (0 to len - 1), None if missing.
 
         Where none of the recording's can be used, its `pixels` raise FrameRefused and say why.
         """
@@ -236,19 +236,19 @@ class DepthFolder(DepthSource, ABC):
         return self._images[i]
 
     def pose_in_file(self, i: int) -> Transform:
-        """Return the pose (4, 4) of frame `i` just as it is given; raises FrameRefused where there is none."""
+        """Return the pose (4, 4) of frame `i` just as it is given; raises FrameRefused if there is none."""
         if isinstance(self._poses, ImagePoses):
             return self._poses.at(i)
         return np.full((4, 4), np.nan) if self._poses is None else self._poses.at(self._images[i].stamp_ns)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused where there is none."""
+        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused if there is none."""
         if not self.posed:
             return np.full((4, 4), np.nan)
         return self._reading.pose(self._pose_as_written(i))
 
     def _pose_as_written(self, i: int) -> Transform:
-        """Return the pose of frame `i` in a right-handed world; raises FrameRefused where there is none."""
+        """Return the pose of frame `i` in a right-handed world; raises FrameRefused if there is none."""
         T = self.pose_in_file(i)
         return in_other_hand(T) if self._mirrored else T
 
@@ -282,7 +282,7 @@ class DepthFolder(DepthSource, ABC):
     def fitted(self, found: Poses | ImagePoses) -> Poses | ImagePoses:
         """Return poses as they belong to the images: by number, by time, or one for each in order.
 
-        Raises SourceError where there are too few or too many and neither numbers nor times say which is whose.
+        Raises SourceError if there are too few or too many and neither numbers nor times say which is whose.
         """
         numbers, known = self.numbers(), image_numbers(found)
         stamps = [image.stamp_ns for image in self._images]
@@ -377,7 +377,7 @@ def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:
 
 
 def photos_in(folder: Path, fps: float) -> list[ImageFile]:
-    """Return the pictures of a folder with their times, as `images_in`; [] where there is no such folder."""
+    """Return the pictures of a folder with their times, as `images_in`; [] if there is no such folder."""
     return images_in(folder, image_pattern(PHOTO_SUFFIXES), fps) if folder.is_dir() else []
 
 

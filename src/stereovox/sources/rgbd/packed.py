@@ -33,7 +33,7 @@ MAX_FRAMES = 1_000_000
 
 
 class Piece(NamedTuple):
-    """A frame in a file: the place and bytes of its depth, and its pose (4, 4), or None where the file has none."""
+    """A frame in a file: the place and bytes of its depth, and its pose (4, 4), or None if the file has none."""
 
     offset: int
     length: int
@@ -115,9 +115,9 @@ class PackedDepth(DepthFolder):
         return data
 
     def poses_beside(self, missing: str) -> Poses | ImagePoses:
-        """Return the poses of the `.freiburg` of the same name beside the file, or of the only one there.
+        """Return the poses of the `.freiburg` of the same name next to the file, or of the only one there.
 
-        Raises NoPoses, which says what is `missing`, where there is none.
+        Raises NoPoses, which says what is `missing`, if there is none.
         """
         beside = sorted(self.file.parent.glob(ICL_POSES))
         same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
@@ -131,7 +131,7 @@ class SensFile(PackedDepth):
 
     Camera and unit are those of its header (its extrinsics are not used, nor are they by ScanNet's own reader). World:
     that of the poses, z up after ScanNet's alignment only. Frames in which tracking was lost (-inf): `no_pose`.
-    Raises SourceError where depth is packed as occi, which only ScanNet's program reads.
+    Raises SourceError if depth is packed as occi, which only ScanNet's program reads.
     """
 
     layout = "a ScanNet .sens file"
@@ -179,8 +179,8 @@ class SensFile(PackedDepth):
 class SlambenchRaw(PackedDepth):
     """A SLAMBench `.raw` file: for each frame width, height, uint16 mm, and again width, height, 8-bit RGB.
 
-    Poses: `?poses=FILE`, or a `.freiburg` beside it. The scenes are those of ICL-NUIM, whose poses are left-handed (see
-    `icl_nuim`), and so is its camera the default for 640x480.
+    Poses: `?poses=FILE`, or a `.freiburg` next to it. The scenes are those of ICL-NUIM, whose poses are left-handed
+    (see `icl_nuim`), and so is its camera the default for 640x480.
     """
 
     layout = "a SLAMBench .raw file"
@@ -195,11 +195,11 @@ class SlambenchRaw(PackedDepth):
         return [Piece(i * step + 8, 2 * width * height, None) for i in range(frames)]
 
     def read_poses(self) -> Poses | ImagePoses:
-        """Return the poses beside the file."""
-        return self.poses_beside("has no poses, nor is one .freiburg beside it; add ?poses=FILE")
+        """Return the poses next to the file."""
+        return self.poses_beside("has no poses, nor is one .freiburg next to it; add ?poses=FILE")
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera of a file beside it, else ICL-NUIM's."""
+        """Return the camera of a file next to it, else ICL-NUIM's."""
         found = find_camera([self.file.parent], size, None, INTRINSICS)
         left_handed = self._poses is not None and self._poses.where.endswith(".freiburg")
         return found._replace(mirrored=left_handed or found.mirrored)

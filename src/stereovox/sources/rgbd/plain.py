@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images with a file or folder of poses beside them, as most programs export recordings."""
+"""Depth images with a file or folder of poses next to them, as most programs export recordings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POSES = Part(
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
 POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
-"""A file with the pose of one image, beside it."""
+"""A file with the pose of one image, next to it."""
 
 
 class DepthPart(Part):
@@ -45,7 +45,7 @@ DEPTH = DepthPart(
 
 
 class DepthAndPoses(DepthFolder):
-    """Depth images in a folder `depth/` (or the like, or beside the poses) and one file or folder of poses.
+    """Depth images in a folder `depth/` (or the like, or next to the poses) and one file or folder of poses.
 
     Poses: see `pose_files` for the forms; those over time need images whose names are times, all others are one for
     each image, in order of the numbers in the names. World: that of the poses.
@@ -62,7 +62,7 @@ class DepthAndPoses(DepthFolder):
         return images_in(folder, pattern, self.fps)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures of a folder beside that of the images, if they are as large."""
+        """Return the pictures of a folder next to that of the images, if they are as large."""
         place = self._images[0].path.parent
         found = (photos_in(place.parent / name, self.fps) for name in FOLDERS if place != self.folder)
         photos = next(filter(None, found), [])
@@ -70,7 +70,7 @@ class DepthAndPoses(DepthFolder):
         return photos if photos and photo_size(photos[0].path) == size else []
 
     def read_poses(self) -> Poses | ImagePoses | None:
-        """Return the poses beside the images: of the first file or folder that holds as many as there are images."""
+        """Return the poses next to the images: of the first file or folder that holds as many as there are images."""
         found, error = [], None
         for path in self.pose_places():
             try:

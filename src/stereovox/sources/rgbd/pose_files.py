@@ -47,7 +47,7 @@ class ImagePoses:
     Args:
         T_world_camera: For each image (4, 4) in metres, or what is wrong with it in one line, or None without a pose.
         where: What they came from, for messages.
-        numbers: The number of the image that each is of; None where they only have an order.
+        numbers: The number of the image that each is of; None if they only have an order.
 
     Raises:
         SourceError: Not one image has a pose.
@@ -144,13 +144,13 @@ def in_other_hand(T: Transform) -> Transform:
 
 
 def number_in(name: str) -> tuple[int, str]:
-    """Return the last number in the name of a file, by which files are put in order, and the name; -1 where none is."""
+    """Return the last number in the name of a file, by which files are put in order, and the name; -1 if none is."""
     found = re.findall(r"\d+", name.rpartition(".")[0] or name)
     return (int(found[-1]) if found else -1), name
 
 
 def image_numbers(poses: Poses | ImagePoses) -> list[int] | None:
-    """Return the numbers of the images that poses are of, None where they have none.
+    """Return the numbers of the images that poses are of, None if they have none.
 
     Stamps of whole seconds that are too small for a date are numbers (ICL-NUIM).
     """
@@ -200,7 +200,7 @@ def _of_json(path: Path) -> ImagePoses:
 
 
 def _extrinsic(camera: object) -> list[float]:
-    """Return the 16 numbers of a camera's extrinsic; empty where it has none."""
+    """Return the 16 numbers of a camera's extrinsic; empty if it has none."""
     found = camera.get("extrinsic") if isinstance(camera, dict) else None
     if not isinstance(found, list) or len(found) != 16 or not all(map(is_number, found)):
         return []

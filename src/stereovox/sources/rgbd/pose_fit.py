@@ -106,7 +106,7 @@ def misfit(images: Images, unit: float, expected: float, now: Reading) -> str:
         now: How the poses are read.
 
     Returns:
-        What is wrong and what to try, in words; empty where nothing speaks against the poses.
+        What is wrong and what to try, in words; empty if nothing speaks against the poses.
     """
     pairs = images.pairs(now)
     if not pairs:
@@ -174,7 +174,7 @@ def _best(
 
 
 def _standing(images: Images, unit: float, now: Reading) -> str:
-    """Say that poses stand still while the images change; empty where they do not."""
+    """Say that poses stand still while the images change; empty if they do not."""
     last = images.number - 1
     try:
         first, *others = [View(images.read(i), now.pose(images.pose(i))) for i in sorted({0, last // 2, last})]

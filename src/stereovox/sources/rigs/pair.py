@@ -31,7 +31,7 @@ OpenDepth = Callable[[Path, PairSettings], DepthSource]
 
 
 class CameraPair(DepthSource):
-    """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker beside them.
+    """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker next to them.
 
     The depth images can be any other recording, so the class is given the function that opens them.
 
@@ -159,7 +159,7 @@ def _stamp(depth: DepthSource, numbers: Sequence[int]) -> int:
 
 
 def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
-    """Raise SourceError where images and poses have no time in common."""
+    """Raise SourceError if images and poses have no time in common."""
     pose_ns = int(poses.stamps_ns[0]), int(poses.stamps_ns[-1])
     if image_ns[0] > pose_ns[1] or pose_ns[0] > image_ns[1]:
         ours, theirs = (f"{seconds_from_ns(a)} to {seconds_from_ns(b)} s" for a, b in (image_ns, pose_ns))

@@ -84,7 +84,7 @@ class RigSource(Source, ABC):
         return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused where there is none."""
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if there is none."""
         shot = self._shots[range(len(self))[i]]
         return self._pose(shot, self.pairs[shot.pair])
 
@@ -117,7 +117,7 @@ class StereoRig(RigSource):
     Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
     Poses and faults: see `RigSource`. Why a pixel has no value is found out by matching (`depth.stereo`); the rig's
     masks make it MASKED. Raises SourceError for a bad rig file, masks or folders that cannot be read, names that are no
-    times, and where there is no image or no file of poses.
+    times, and if there is no image or no file of poses.
     Names of several images that span less than a millisecond are no times.
     """
 

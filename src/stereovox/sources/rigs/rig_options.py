@@ -45,7 +45,7 @@ def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
     """Return the poses in a file or folder of any form (see `rgbd.pose_files`), over time.
 
     stamps_ns: times of the images in ascending order. Poses without times are one for each of them. So are those whose
-    times have nothing in common with theirs, where there are as many. Raises SourceError where there are not.
+    times have nothing in common with theirs, where there are as many. Raises SourceError if there are not.
     """
     found, stamps = read_poses(path), sorted(set(stamps_ns))
     if isinstance(found, Poses):

@@ -45,7 +45,7 @@ class TwoView(RigSource):
     eyes may differ in cx (`doffs`), then the images are shifted as they are rectified. Images that are smaller or
     larger than it says, by one factor, get its calibration times that factor, with a note.
     World: the left eye of each scene, upright (z up, x forward); there are no poses. Time: a second for each scene.
-    Faults: see `RigSource`. Raises SourceError where a calibration is missing or bad.
+    Faults: see `RigSource`. Raises SourceError if a calibration is missing or bad.
     """
 
     layout = "a stereo pair of Middlebury or ETH3D (im0.png, im1.png and calib.txt)"

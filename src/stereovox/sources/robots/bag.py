@@ -37,7 +37,7 @@ class RobotOptions:
     """What may stand behind the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
 
     scan, depth, info, odom, truth: topics of scans (or point clouds), depth images, their CameraInfo, odometry
-        (nav_msgs/Odometry, in place of tf) and true poses of the robot, where they are not found or not the right ones.
+        (nav_msgs/Odometry, in place of tf) and true poses of the robot, if they are not found or not the right ones.
     base_frame, odom_frame: frames of the robot and of its odometry.
     mount, camera_mount: where lidar and camera sit on the robot, in place of tf: x,y,z in metres, then yaw, pitch and
         roll in radians, of which the last may be left out. A camera without turn looks forward.
@@ -102,7 +102,7 @@ class RobotBag:
     World: the frame of the odometry (`odom` in tf); without it poses of a nav_msgs/Odometry topic; without that the
     robot is taken to stand still, which SLAM can put right. A pose is looked up in tf at the time of the scan or image,
     interpolated; gaps longer than `max_gap` are not bridged. Sensors that tf does not mount are taken for mounted at
-    the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is told in `notes`.
+    the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is reported in `notes`.
 
     Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
     Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
@@ -196,7 +196,7 @@ def posed_scan(message: LaserScan, T_odom_sensor: Transform, T_base_sensor: Tran
 
 
 def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
-    """Return the named depth images, or else those of the busiest topic, and notes; None if there are none.
+    """Return the named depth images, or else those of the busiest topic, and notes; None if missing.
 
     Unless they were named, unusable images (without CameraInfo) only cause a note.
     """

@@ -43,7 +43,7 @@ class CarmenLog:
     The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
     are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
     named in `notes`. `frames` is empty, `truth` unknown.
-    Raises SourceError where the file cannot be read or holds no scan.
+    Raises SourceError if the file cannot be read or holds no scan.
     """
 
     def __init__(self, where: str):

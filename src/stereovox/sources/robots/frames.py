@@ -34,9 +34,9 @@ class FrameOptions:
 class RobotFrames:
     """Poses of a robot's sensors in the world of its odometry.
 
-    sensors: frames named by the sensors, "" where there is no name; they help to choose the robot's own. tf: all
+    sensors: frames named by the sensors, "" if there is no name; they help to choose the robot's own. tf: all
     transforms; empty without /tf. `mount` adds assumed ones. base, odom: frames of the robot and of its odometry; odom
-    is "" where the robot is assumed to stand still. notes: assumptions made. Raises SourceError for given topics and
+    is "" if the robot is assumed to stand still. notes: assumptions made. Raises SourceError for given topics and
     frames that do not exist.
     """
 
@@ -119,7 +119,7 @@ class RobotFrames:
         return self.base, (f"{self.path}: {topic} tells where {child} is: taken for {self.base}",)
 
     def _named(self, name: str, option: str) -> str:
-        """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" where there is none."""
+        """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" if there is none."""
         near = [frame for frame in self.tf.frames if frame.rpartition("/")[2] == name]
         near = [frame for frame in near if any(self.tf.connected(frame, other) for other in self._sensors)] or near
         if len(near) > 1 and name not in near:

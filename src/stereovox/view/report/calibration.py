@@ -39,7 +39,7 @@ CONDITIONS = (
 def write_wall_report(folder: str | Path, found: WallCalibration, camera_file: str) -> Path:
     """Write `wall.html` and `wall.png` into `folder`, created if missing, and return the page's path.
 
-    Raises StereovoxError where they cannot be written.
+    Raises StereovoxError if they cannot be written.
     """
     png = wall_png(found)
     return write_page(Path(folder), "wall", wall_page(found, png, camera_file), png)

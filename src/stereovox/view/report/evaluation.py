@@ -35,7 +35,7 @@ HEADS = {
 }
 DECIDED = (
     "Free means that a robot may drive there. So the error that kills is a surface called free; worse, with nothing "
-    "tentative or occupied beside it. A robot stops for what is occupied, and often for what is tentative or unknown. "
+    "tentative or occupied next to it. A robot stops for what is occupied, and often for what is tentative or unknown. "
     "The map decides by its own thresholds; only cells count that the truth knows."
 )
 BY_PARTS = (

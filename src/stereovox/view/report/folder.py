@@ -10,7 +10,7 @@ from stereovox.files.safe_io import check_local
 
 
 def out_folder(out: str | Path) -> Path:
-    """Return the folder `out`, created if missing; raises StereovoxError, one line, where that fails."""
+    """Return the folder `out`, created if missing; raises StereovoxError, one line, if that fails."""
     check_local(out)
     folder = Path(out)
     try:

@@ -30,7 +30,7 @@ OBSERVED = "Cells known to both maps"
 TALLY = ("cells", "tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "correlation")
 DIFFERENCE = (
     "Light and dark grey are right. Where one pixel stands for several cells it shows a wrong wall before all else. "
-    "difference.png beside this page is the binary image with a pixel for each cell."
+    "difference.png next to this page is the binary image with a pixel for each cell."
 )
 
 
@@ -39,7 +39,7 @@ def write_grid_report(
 ) -> Path:
     """Write `evaluation.html` and `difference.png`, one pixel per cell, into `folder`; return the page's path.
 
-    name, reference: names of the maps. Raises StereovoxError where they cannot be written.
+    name, reference: names of the maps. Raises StereovoxError if they cannot be written.
     """
     text = grid_page(scores, laid, name, reference)
     return page.write_files(folder, {"evaluation.html": text.encode(), "difference.png": binary_png(laid)})

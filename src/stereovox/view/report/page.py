@@ -29,7 +29,7 @@ def page(title: str, lead: str, *parts: str) -> str:
 def write_page(folder: str | Path, name: str, text: str) -> Path:
     """Write a page into `folder`, created if missing, and return its path.
 
-    Raises StereovoxError, one line, where it cannot be written.
+    Raises StereovoxError, one line, if it cannot be written.
     """
     return write_files(folder, {name: text.encode()})
 

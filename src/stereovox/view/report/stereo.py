@@ -37,7 +37,7 @@ EYES = ("left", "right")
 def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: str) -> Path:
     """Write `stereo.html` and `stereo.png` into `folder`, created if missing, and return the page's path.
 
-    Raises StereovoxError where they cannot be written.
+    Raises StereovoxError if they cannot be written.
     """
     png = stereo_png(found)
     return write_page(Path(folder), "stereo", stereo_page(found, png, rig_file), png)

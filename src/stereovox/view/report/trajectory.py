@@ -35,7 +35,7 @@ def write_trajectory_report(
 ) -> Path:
     """Write `evaluation.html` and `trajectory.png` into `folder`; return the page's path.
 
-    name, truth: names of the trajectories. Raises StereovoxError where they cannot be written.
+    name, truth: names of the trajectories. Raises StereovoxError if they cannot be written.
     """
     png = trajectory_png(score)
     text = page.page(

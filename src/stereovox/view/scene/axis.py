@@ -30,7 +30,7 @@ def draw_axis(
     """Return a figure of the log-odds of the cells along the camera's optical axis.
 
     length_m: length of the axis; by default the map's `max_range`. viewpoint: by default the map's last.
-    counted: as for `draw_view`. Raises StereovoxError where the camera is not known.
+    counted: as for `draw_view`. Raises StereovoxError if the camera is not known.
     """
     figure = figure_of(6.5)
     axis = figure.add_subplot()
@@ -47,7 +47,7 @@ def draw_profile(
 ) -> tuple[float, float] | None:
     """Draw one step per cell in its state's colour, with the thresholds; in bytes where the map has them.
 
-    Returns the start and end of the first occupied cells in metres, None where there are none.
+    Returns the start and end of the first occupied cells in metres, None if missing.
     """
     T = known_viewpoint(viewpoint or voxel_map.viewpoint).T_world_camera
     distance, log_odds = along_ray(voxel_map, T[:3, 3], T[:3, 2], length_m or voxel_map.config.max_range)

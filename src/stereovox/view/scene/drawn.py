@@ -17,7 +17,7 @@ from stereovox.maps.upright import turned as turned
 from stereovox.view.scene.shading import Occlusion
 
 BESIDE = 0.1
-"""A camera's path is drawn up to this share of the map's longest side beside its known cells."""
+"""A camera's path is drawn up to this share of the map's longest side next to its known cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Drawn:
 
     @cached_property
     def cut(self) -> float | None:
-        """Height in metres above which cells are hidden, None where all are drawn."""
+        """Height in metres above which cells are hidden, None if all are drawn."""
         if len(self.below_ceiling) == len(self.occupied):
             return None
         return ceiling(self.occupied) * self.voxel_size

@@ -48,7 +48,7 @@ class Rendering:
     """An RGBA image (height, width, 4) float32 and what it covers: left, right, bottom, top in picture metres.
 
     near: (rows, columns) float32, how far towards the viewer the centre of the cell in each pixel is, in metres; -inf
-    where there is none. It may be finer than the image.
+    if there is none. It may be finer than the image.
     """
 
     image: NDArray[np.float32]
@@ -103,7 +103,7 @@ def render(
 
 
 class _Canvas:
-    """An image that keeps for each pixel the largest number written to it, -1 where none was."""
+    """An image that keeps for each pixel the largest number written to it, -1 if none was."""
 
     def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], scale: float):
         self.low, self.high, self.scale = low, high, scale
@@ -185,7 +185,7 @@ def _shade(
 
 
 def _contour(near: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-    """Return a brightness (height, width) that darkens pixels beside something nearer: it makes edges stand out."""
+    """Return a brightness (height, width) that darkens pixels next to something nearer: it makes edges stand out."""
     shadow = np.zeros_like(near)
     with np.errstate(invalid="ignore"):
         for axis in (0, 1):

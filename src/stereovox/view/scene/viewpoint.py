@@ -21,7 +21,7 @@ USUAL = PinholeCamera.from_field_of_view(848, 480, 91.2, 0.05)
 
 
 def known_viewpoint(viewpoint: Viewpoint | None) -> Viewpoint:
-    """Return `viewpoint`; raises StereovoxError where there is none."""
+    """Return `viewpoint`; raises StereovoxError if there is none."""
     if viewpoint is None:
         raise StereovoxError("the map does not know where its camera stood; say so: --eye=X,Y,Z --toward=X,Y,Z")
     return viewpoint
@@ -32,7 +32,7 @@ def viewpoint_at(
 ) -> Viewpoint | None:
     """Return a viewpoint at `eye` that looks `toward` a point, both in metres, world frame; else the map's own.
 
-    The camera is the map's last one, or a D435's. Raises StereovoxError where only one of the two is given, or they
+    The camera is the map's last one, or a D435's. Raises StereovoxError if only one of the two is given, or they
     name the same point.
     """
     if eye is None and toward is None:

@@ -243,7 +243,7 @@ def _yardstick(exact: AisleFound) -> Claim:
 
 
 def _claims(one: AisleFound, exact: AisleFound) -> list[Claim]:
-    """Return what is claimed of stereovox's own rule: nearly all that exact rays find, and nothing more beside it."""
+    """Return what is claimed of stereovox's own rule: nearly all that exact rays find, and nothing more next to it."""
     text = f"{one.variant.name}: at least {100 * MIN_SHARE:.0f} % of the far cells that exact rays find"
     stray = f"{percent(one.stray)} against {percent(exact.stray)}"
     return [

@@ -44,7 +44,7 @@ THINNED = 2
 """Only every so many pixels, across and down, are asked what they see of a wall: it is the wall's cells that count."""
 PAPER = (
     "The result looks precise due to the on-board SLAM and re-localization of the T265. The walls are solid and "
-    "straight and the corner is 90 degrees. The floor plan stands beside it; 255 is occupied, 0 free."
+    "straight and the corner is 90 degrees. The floor plan stands next to it; 255 is occupied, 0 free."
 )
 OUR_PICTURE = (
     "True floor plan (walls black, furniture brown) with the camera's way; how far the tracker is off; then the "
@@ -239,7 +239,7 @@ def scan_apartment(
 
 
 def _recorded(simulation: Simulation, tracker: T265, folder: Path) -> tuple[Recording, CameraPair]:
-    """Record the tracker beside tiny images: the pair tells where the large ones were taken."""
+    """Record the tracker next to tiny images: the pair tells where the large ones were taken."""
     tiny = Simulation(f"{simulation.name}{'&' if '?' in simulation.name else '?'}image_width=16", noise=False)
     recording = record(tiny, folder, tracker, MOUNT)
     return recording, CameraPair(folder, open_depth)
@@ -296,7 +296,7 @@ def chapter(found: Apartment) -> Chapter:
         "of 1 % of the way, re-localisation where it has been before, a clock of its own, a mount one degree out of "
         f"line. It is off by {100 * off['median_m']:.0f} cm (median), {100 * off['max_m']:.0f} cm at most, "
         f"{100 * off['end_m']:.0f} cm at the end. Walls are measured where the camera saw them often enough and "
-        "neither furniture nor doors stand before them; 15 cm beside corners, floor and ceiling are left out.",
+        "neither furniture nor doors stand before them; 15 cm next to corners, floor and ceiling are left out.",
         [claim for name, one in figures.items() for claim in _claims(name, one)],
         [Shown("Fig 4.11", PAPER, OUR_PICTURE, picture)],
         [_walls(found.scans), _corners(found.scans)],

@@ -92,7 +92,7 @@ class BoxFound:
     """A box as it stands in a map.
 
     cells: (N, 3) its occupied cells. errors: (5,) cells by which its left, right, top, bottom and front lie further
-        out (positive) or in than the cells that hold the true sides; None where no cell is occupied.
+        out (positive) or in than the cells that hold the true sides; None if no cell is occupied.
     width: occupied cells side by side in the fullest row of the layer just below the optical axis.
     hidden, hidden_known: cells behind the box that no ray can reach, and how many of them are not unknown.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of one's own under the profile of a paper, beside the same under `default`."""
+"""A recording of one's own under the profile of a paper, next to the same under `default`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def overview_png(voxel_map: VoxelMap, way: NDArray[np.float64], heading: str) ->
 def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:
     """Return a chapter about a recording; without truth there is nothing to claim.
 
-    Raises StereovoxError where no frame of it can be used.
+    Raises StereovoxError if no frame of it can be used.
     """
     mappers = {name: Mapper(name, **{"window.size": None, "up": "z"}) for name in PROFILES}
     reports = {name: [] for name in PROFILES}

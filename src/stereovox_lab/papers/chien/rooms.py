@@ -33,7 +33,7 @@ BESIDE_M = 0.15
 REACH_M = 0.24
 """Occupied cells up to so far before and behind a wall's face are taken for the wall, which is 0.25 m thick."""
 INSET_M = 0.15
-"""So much of a wall beside a corner, the floor and the ceiling is not judged: the other wall stands there too."""
+"""So much of a wall next to a corner, the floor and the ceiling is not judged: the other wall stands there too."""
 IN_FRONT_M = 0.4
 """Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
 INNER_HALF_M, OUTER_M = 0.06, 0.25
@@ -44,7 +44,7 @@ def measure_outer(voxel_map: VoxelMap, stage: Stage, only: Keys, others: Keys) -
     """Return the outer walls by side, as their faces towards the rooms stand in a map.
 
     only, others: see `measure_wall`; places where inner walls end are left out besides.
-    Raises StereovoxError where one of them stands in too few columns.
+    Raises StereovoxError if one of them stands in too few columns.
     """
     ends = _inner_walls(stage, voxel_map.voxel_size)
     of_side = {side: [face for face in stage.faces if face.name.endswith(f" {side}")] for side in SIDES}
@@ -140,7 +140,7 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
     """Measure all sides of all rooms in a map in Chien's axes (y down).
 
     stage: the apartment in the map's frame; well_seen: cells that its walls touch and that were seen often enough.
-    Raises StereovoxError where not one wall can be measured.
+    Raises StereovoxError if not one wall can be measured.
     """
     size = voxel_map.voxel_size
     others = _other_things(stage, size)
@@ -161,7 +161,7 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
 def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, others: Keys | None = None) -> WallFound:
     """Measure one side of a room. Cells behind the middle of an inner wall belong to the other room's side.
 
-    Raises StereovoxError where too little of it stands in the map.
+    Raises StereovoxError if too little of it stands in the map.
     """
     behind = OUTER_M if _outer(face.name) else INNER_HALF_M
     return measure_wall(_only_near(voxel_map, face, behind), _inset(face), only=only, others=others, reach=IN_FRONT_M)

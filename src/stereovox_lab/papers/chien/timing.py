@@ -218,7 +218,7 @@ def _batches(location: str, frames: int) -> Iterator[list[Frame]]:
 
 
 def times_png(rows: Sequence[Timed]) -> bytes:
-    """Return the milliseconds of a whole frame as bars, the thesis's beside ours."""
+    """Return the milliseconds of a whole frame as bars, the thesis's next to ours."""
     figure = figure_of(0.5 * len(rows) + 1.0)
     axis = figure.add_subplot()
     place = np.arange(len(rows))

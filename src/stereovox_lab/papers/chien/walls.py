@@ -78,7 +78,7 @@ def measure_wall(
     through. Columns within one cell of the rectangle's rim are left out: another wall begins there.
     only: cells (N,) that were seen well; columns without one are left out. others: cells that something else than the
     wall touches; columns with one within `reach` metres of the face are left out.
-    Raises StereovoxError where fewer than three columns hold an occupied cell.
+    Raises StereovoxError if fewer than three columns hold an occupied cell.
     """
     size = voxel_map.voxel_size
     occupied = _near(occupied_cells(voxel_map), wall, size, reach)
@@ -99,7 +99,7 @@ def measure_wall(
 def judged_columns(
     wall: Wall, size: float, *, only: Keys | None = None, others: Keys | None = None, reach: float = REACH
 ) -> Keys:
-    """Return the columns (N,) through `wall` that `measure_wall` looks at, ascending; empty where none was seen well.
+    """Return the columns (N,) through `wall` that `measure_wall` looks at, ascending; empty if none was seen well.
 
     size: side of a cell in metres; the others: see `measure_wall`.
     """

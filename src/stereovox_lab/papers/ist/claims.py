@@ -118,7 +118,7 @@ def _doubts(found: Survey, holds: bool | None) -> Claim:
 
 
 def _doubted(claim: Claim) -> Claim:
-    """Return a claim on maps beside the reference, which is doubted: so it does not hold, whatever its figure."""
+    """Return a claim on maps next to the reference, which is doubted: so it does not hold, whatever its figure."""
     return claim if claim.holds is None else replace(claim, holds=False, ours=f"{claim.ours}; the reference is doubted")
 
 

@@ -67,7 +67,7 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive that is about to be recorded. first: the earlier one; the same where there is none."""
+    """A drive that is about to be recorded. first: the earlier one; the same if there is none."""
 
     place: Place
     floor: Floor

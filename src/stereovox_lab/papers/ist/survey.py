@@ -81,7 +81,7 @@ class Survey:
 def survey(recording: Recording, variants: Sequence[Variant], out: Path, step: Step) -> Survey:
     """Run the chain; step is called after each scan of both passes over the lidar, and after each depth image.
 
-    Raises StereovoxError where the recording lacks scans or depth images.
+    Raises StereovoxError if the recording lacks scans or depth images.
     """
     _check(recording.robot)
     reference = _reference(recording, out, step)

@@ -27,7 +27,7 @@ NOT_APART = "one drive alone, which cannot be cut in two; add another drive"
 class Apart:
     """A map, and the scores that claims are made of. All by the kind of truth, `view` and `rays`.
 
-    chosen: precision and recall where thresholds are chosen; None where there is no such place. scored: scores of the
+    chosen: precision and recall where thresholds are chosen; None if there is no such place. scored: scores of the
     rest, which thresholds are never chosen on. where: both places, in words.
     """
 
@@ -39,7 +39,7 @@ class Apart:
     def point(
         self, kind: str, names: tuple[str, str], wanted: tuple[float, float] = (0.0, 0.0)
     ) -> dict[str, float | None] | None:
-        """Return the scored point at the threshold that `best` picks on the other part; None where there is none."""
+        """Return the scored point at the threshold that `best` picks on the other part; None if missing."""
         if self.chosen is None:
             return None
         return at(self.scored[kind].curve, self.chosen[kind].best(names, wanted)["threshold"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chapters of the evaluation: Table 8.1 beside ours, one chapter per drive, and the times."""
+"""Chapters of the evaluation: Table 8.1 next to ours, one chapter per drive, and the times."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TARGET = "#5b8c5a"
 TRUTH = (
     "Truth: a cell is occupied where one lidar point of any frame falls into it that is in the left image and on "
     "nothing annotated as an object. Cells count that some frame has in view and in range. Free are all others; "
-    "beside it stands a second, kinder truth, whose free cells are only those that a lidar ray crossed. The first "
+    "next to it stands a second, kinder truth, whose free cells are only those that a lidar ray crossed. The first "
     "blames a map for every surface that the sparse lidar missed, the second asks only where the lidar knows."
 )
 OTHER_DATA = (
@@ -48,13 +48,13 @@ OTHER_DATA = (
 MEASURES = (
     "Exact and within one cell: a cell called occupied is right where the truth has a surface in it, or within one "
     "cell along each axis; recall likewise. The thesis's rule is p > 0.7; one hit leaves a cell of OctoMap at 0.7, so "
-    "p >= 0.7 is told as well. Balanced: the threshold at which the lesser of precision and recall within one cell is "
+    "p >= 0.7 is reported. Balanced: the threshold at which the lesser of precision and recall within one cell is "
     "largest where thresholds are chosen, never where they are scored. Cells never observed count as free; error and "
     "calibration are over observed cells, as in the thesis."
 )
 ALL_CELLS = (
     "The thesis takes the correlation over all cells of the truth, unobserved ones at p = 0.5, and so it is counted "
-    "here, beside that over observed cells. Most unobserved cells lie behind surfaces, so it also tells how much of "
+    "here, next to that over observed cells. Most unobserved cells lie behind surfaces, so it also reports how much of "
     "the box was never seen, the more so the surer a map is of the free air that it did see."
 )
 RULES = (
@@ -132,7 +132,7 @@ def thresholds_sheet(maps: Sequence[Apart]) -> Sheet:
 
 
 def targets_sheet(maps: Sequence[Apart]) -> Sheet:
-    """Return what each map reaches of the targets, also where nothing is claimed."""
+    """Return what each map reaches of the targets, also if nothing is claimed."""
     found = {(one.judged.setting, one.judged.mapper): one for one in maps}
     rows, heads = [], ()
     for (setting, mapper), kind in product(found, KINDS):
@@ -214,7 +214,7 @@ def _reliability(axis: Any, one: Apart) -> None:
 
 
 def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> Chapter:
-    """Return Table 8.1 beside the same of all drives at one setting. missing: why there is no OctoMap."""
+    """Return Table 8.1 next to the same of all drives at one setting. missing: why there is no OctoMap."""
     shown = [one for one in judged if one.setting == setting]
     rows = [(f"{one.drive}, {one.mapper}", *row_of(vars(one.scores[CLAIMED]), TABLE)) for one in shown]
     thesis = [(f"thesis, {row.sequence}", *row_of(vars(row), TABLE)) for row in PRINTED]
@@ -266,7 +266,7 @@ def speed_chapter(speeds: Sequence[Speed]) -> Chapter:
     ]  # fmt: skip
     heads = ("profile", "image", "frames", "cores", "frames a second", *(f"{part}, ms (90 %)" for part in parts))
     method = (
-        "From image files to the updated map, two threads; files are read ahead beside the rest. Second of two passes. "
+        "From image files to the updated map, two threads; files are read ahead meanwhile. Second of two passes. "
         "The claim is meant for a machine that does nothing else: fewer cores or other work make it slower."
     )
     sheets = [Sheet("Where the time goes", heads, rows)]

@@ -25,7 +25,7 @@ CLAIMED = "view"
 Found = Mapping[tuple[Setting, str], Apart]
 """All maps of a drive by setting and mapper."""
 Point = Mapping[str, float | None] | None
-"""Threshold, precision and recall, exact and within one cell; None where no threshold could be chosen apart."""
+"""Threshold, precision and recall, exact and within one cell; None if no threshold could be chosen apart."""
 LESS_IS_BETTER = {"error", "calibration error"}
 
 
@@ -42,7 +42,7 @@ TARGETS = {0.5: Target(0.92, 0.95, 0.72), 0.4: Target(0.90, 0.94, 0.70), 0.2: Ta
 
 
 class Result(NamedTuple):
-    """One target, and what a map reached of it; holds: None where it cannot be judged, unjudged: why not."""
+    """One target, and what a map reached of it; holds: None if it cannot be judged, unjudged: why not."""
 
     letter: str
     text: str

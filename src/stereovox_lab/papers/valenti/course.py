@@ -57,7 +57,7 @@ def rank_correlation(values: NDArray[np.floating]) -> float:
 
 
 def _values(one: Judged, name: str) -> NDArray[np.float64] | None:
-    """Return the measure after each frame in which it has a value; None where those are too few."""
+    """Return the measure after each frame in which it has a value; None if those are too few."""
     assert one.series is not None
     values = np.asarray(one.series.get(name, ()), float)
     values = values[np.isfinite(values)]

@@ -67,10 +67,10 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
 class Judged:
     """One map of one drive. scores: by the kind of truth, `view` and `rays`, see `lidar_truth`.
 
-    halves: likewise those of the street's first and second half; None where they were not asked for, or where the way
+    halves: likewise those of the street's first and second half; None if they were not asked for, or where the way
     is too short.
     series: measures against the frame, truth `view` (Valenti 2018, Fig 8.4), and shown: cells for a picture; both None
-    where they were not asked for.
+    if they were not asked for.
     """
 
     drive: str
@@ -155,7 +155,7 @@ def _way(drive: Drive, numbers: Sequence[int]) -> NDArray[np.float64]:
 
 
 def _halves(truths: Mapping[str, TruthCells], way: NDArray[np.float64]) -> Halves | None:
-    """Return each truth at the first and at the second half of the way; None where one of them has no surface."""
+    """Return each truth at the first and at the second half of the way; None if one of them has no surface."""
     found = {}
     for kind, truth in truths.items():
         parts = halves(way, truth.centers())

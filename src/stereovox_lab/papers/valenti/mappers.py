@@ -88,7 +88,7 @@ class Contestant(Protocol):
 
 
 def make_contestant(name: str, setting: Setting) -> Contestant:
-    """Return the mapper of this name in `MAPPERS`. Raises MissingExtra where its library is not installed."""
+    """Return the mapper of this name in `MAPPERS`. Raises MissingExtra if its library is not installed."""
     return OctomapContestant(setting) if name == OCTOMAP else _Ours(config_of(name, setting))
 
 

@@ -78,7 +78,7 @@ def misprints() -> dict[tuple[str, str], float]:
 
 
 def row_of_drive(drive: str) -> PrintedRow | None:
-    """Return the printed row of a drive, None where the table has none of it."""
+    """Return the printed row of a drive, None if the table has none of it."""
     rows = {SEQUENCE + row.sequence: row for row in PRINTED}
     return rows.get(drive)
 
@@ -94,7 +94,7 @@ def better(name: str, ours: float, printed: float) -> bool:
 
 
 def own_claims() -> list[Claim]:
-    """Return, for each kind of figure, whether the printed ones agree with the counts beside them."""
+    """Return, for each kind of figure, whether the printed ones agree with the counts next to them."""
     off = misprints()
     claims = []
     for name in COUNTED:

@@ -26,7 +26,7 @@ MAX_FRAMES = 100
 class Speed:
     """How fast a profile maps a drive, image files to updated map, files read ahead by a thread of their own.
 
-    hertz: frames a second over all; ms: median and further percentiles of each part, reading runs beside the others.
+    hertz: frames a second over all; ms: median and further percentiles of each part, reading runs next to the others.
     cores: processors this process may use.
     """
 

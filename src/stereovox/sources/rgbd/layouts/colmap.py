@@ -189,7 +189,7 @@ class Colmap(DepthFolder):
 
 
 def model_folder(folder: str | os.PathLike[str], places: Sequence[str] = MODELS) -> Path | None:
-    """Return the first of `places` in a folder that holds cameras and images of a model, None where none does."""
+    """Return the first of `places` in a folder that holds cameras and images of a model, None if none does."""
     for place in places:
         for suffix in (".bin", ".txt"):
             paths = [os.path.join(folder, place, f"{name}{suffix}") for name in ("cameras", "images")]
@@ -199,7 +199,7 @@ def model_folder(folder: str | os.PathLike[str], places: Sequence[str] = MODELS)
 
 
 def _places(folder: Path) -> tuple[Path, Path | None]:
-    """Return the folder of the model, and that of COLMAP's own depth maps where there are no others."""
+    """Return the folder of the model, and that of COLMAP's own depth maps if there are no others."""
     others = any((folder / place).is_dir() for place in DEPTHS)
     for root in () if others else ROOTS:
         own = folder / root / "stereo/depth_maps"

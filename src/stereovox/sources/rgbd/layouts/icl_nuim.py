@@ -51,7 +51,7 @@ class IclNuim(DepthFolder):
         return images_in(self.folder / IMAGES, image_pattern(), self.fps)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures beside them."""
+        """Return the pictures next to them."""
         return photos_in(self.folder / PICTURES, self.fps)
 
     def read_poses(self) -> Poses | ImagePoses:

@@ -26,8 +26,8 @@ MOST_BYTES = 2 * max(width * height for width, height in SIZES)
 class KlgLog(PackedDepth):
     """A number of frames, then for each its time, depth (uint16 mm, zlib or plain) and picture (not read).
 
-    The size of the images follows from the bytes of the first. Poses: `?poses=FILE`, or the one `.freiburg` beside it,
-    as ElasticFusion writes; world: the first camera's. Camera: a file beside it, else for 640x480 ElasticFusion's
+    The size of the images follows from the bytes of the first. Poses: `?poses=FILE`, or the one `.freiburg` next to it,
+    as ElasticFusion writes; world: the first camera's. Camera: a file next to it, else for 640x480 ElasticFusion's
     528 528 320 240, with a note.
     """
 
@@ -71,14 +71,14 @@ class KlgLog(PackedDepth):
         return data if len(data) == 2 * width * height else zlib.decompressobj().decompress(data, MOST_BYTES)
 
     def read_poses(self) -> Poses | ImagePoses:
-        """Return the poses beside the file."""
+        """Return the poses next to the file."""
         return self.poses_beside(
-            "a .klg log holds depth but no poses, nor is one .freiburg beside it; add ?poses=FILE (ElasticFusion "
+            "a .klg log holds depth but no poses, nor is one .freiburg next to it; add ?poses=FILE (ElasticFusion "
             "writes one at its end)"
         )
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera of a file beside it, else ElasticFusion's."""
+        """Return the camera of a file next to it, else ElasticFusion's."""
         return find_camera([self.file.parent], size, None, INTRINSICS)
 
     @classmethod

@@ -36,7 +36,7 @@ class Replica(DepthAndPoses):
         super().__init__(where, posed)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures among the depth images, else those of a folder beside them."""
+        """Return the pictures among the depth images, else those of a folder next to them."""
         return images_in(self._images[0].path.parent, r"(frame|rgb_?)\d+\.(jpg|png)", self.fps) or super().list_photos()
 
     def pose_places(self) -> list[Path]:

@@ -82,7 +82,7 @@ class RtabmapExport(DepthFolder):
 
 
 class _Calibration:
-    """The calibration of one image; raises SourceError where it is no pinhole camera."""
+    """The calibration of one image; raises SourceError if it is no pinhole camera."""
 
     def __init__(self, path: Path):
         table, self.path = read_yaml(path), path

@@ -107,7 +107,7 @@ class RtabmapDatabase(DepthFolder):
         return [node.id for node, _ in self._views]
 
     def size(self) -> tuple[int, int]:
-        """Return (width, height) of the images of one camera; raises SourceError where none can be read."""
+        """Return (width, height) of the images of one camera; raises SourceError if none can be read."""
         found, fault = Counter[tuple[int, int]](), "there is no image"
         for i in np.unique(np.linspace(0, len(self) - 1, 5).astype(int)).tolist():
             try:
@@ -169,7 +169,7 @@ class RtabmapDatabase(DepthFolder):
         ]
 
     def _optimised(self, version: tuple[int, ...]) -> dict[int, Transform]:
-        """Return the poses of the optimised graph by node; empty where it was not saved."""
+        """Return the poses of the optimised graph by node; empty if it was not saved."""
         if version < (0, 17, 0):
             return {}
         ids, poses = next(iter(self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")), (None, None))

@@ -70,7 +70,7 @@ class SevenScenes(DepthFolder):
         return find_camera(folders, size, self.baseline, self.intrinsics, (*names, *NAMES))
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the colour images of a Kinect, whose place beside the depth camera is known."""
+        """Return the colour images of a Kinect, whose place next to the depth camera is known."""
         if any(_tells_camera(folder / name) for folder in (self.folder, self.folder.resolve().parent) for name in INFO):
             return []
         found = [(int(match[1]), name) for name in file_names(self.folder) if (match := PHOTO.fullmatch(name))]

@@ -10,6 +10,7 @@ from pathlib import Path
 from time import monotonic, monotonic_ns
 
 import pytest
+from house import circles_of, import_graphs, modules_of
 
 import stereovox
 from stereovox.mapper import GridMapper, Mapper
@@ -123,41 +124,10 @@ def broken_rules(root: Path) -> list[str]:
     return found
 
 
-def circles(root: Path) -> list[set[str]]:
-    """Return the sets of files of the package at `root` that import each other in a circle, wherever in them.
-
-    The package's own `__init__.py` only names where things are, and does not count.
-    """
-    files = {module_name(path, root): path for path in sorted(root.rglob("*.py")) if path != root / "__init__.py"}
-    needs = {}
-    for name, path in files.items():
-        package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-        found = (full for _, full in imported(ast.parse(path.read_text()), package))
-        needs[name] = {m for full in found if (m := nearest(full, files)) and m != name}
-    reach = {name: reachable(name, needs) for name in needs}
-    rings = {frozenset(other for other in reach[name] if name in reach[other]) for name in needs if name in reach[name]}
-    return sorted((set(ring) for ring in rings), key=min)
-
-
-def module_name(path: Path, root: Path) -> str:
-    """Return the name under which a file is imported."""
-    return ".".join(("stereovox", *path.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
-
-
-def nearest(full: str, files: dict[str, Path]) -> str | None:
-    """Return the module that a full name is, or is in."""
-    return next((name for name in (full, full.rpartition(".")[0]) if name in files), None)
-
-
-def reachable(start: str, needs: dict[str, set[str]]) -> set[str]:
-    """Return all modules that can be come to from one, itself only where a circle leads back."""
-    found: set[str] = set()
-    left = [start]
-    while left:
-        new = needs[left.pop()] - found
-        found |= new
-        left += new
-    return found
+def circles(root: Path) -> list[list[str]]:
+    """Return the sets of files of the package at `root` that import each other in a circle, wherever in them."""
+    real, typed = import_graphs(modules_of(root))
+    return circles_of({name: real[name] | typed[name] for name in real})
 
 
 def test_the_rules_hold():
@@ -183,7 +153,7 @@ def test_circles_are_found(tmp_path):
         "d": 'KINDS = {"a": "stereovox.a:f"}',
     }.items():
         (tmp_path / f"{name}.py").write_text(text + "\n")
-    assert circles(tmp_path) == [{"stereovox.a", "stereovox.b", "stereovox.c"}]
+    assert circles(tmp_path) == [["a", "b", "c"]]
 
 
 def test_the_drawing_in_contributing_is_this_house():

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lint, format and types are clean: the same three commands a contributor runs by hand."""
+"""Lint, format and types are clean, as by the three commands a contributor runs by hand; the house stays small."""
 
 import ast
 import importlib.util
+import io
+import re
 import subprocess
 import sys
+import tokenize
 from pathlib import Path
 
 import pytest
+from house import house
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = {
@@ -15,6 +19,27 @@ COMMANDS = {
     "format": ["ruff", "format", "--no-cache", "--check"],
     "types": ["basedpyright", "--pythonpath", sys.executable],
 }
+
+MOST = {
+    "modules": 600,
+    "lines": 90_300,
+    "loose modules at the root": 7,
+    "rooms": 34,
+    "floors": 15,
+    "modules of the laboratory": 80,
+    "lines of the laboratory": 11_500,
+    "words of README and docs": 51_900,
+}
+"""Budgets. Raising one needs a reason in CHANGELOG.md."""
+HABITS = {
+    "way, for path or manner": (r"\bways?\b", 1.17),
+    "tell, for report": (r"\b(?:tells?|told|telling)\b", 0.81),
+    "beside, for next to": (r"\bbeside\b", 0.09),
+    "believe, for accept": (r"\bbeliev(?:e[sd]?|ing)\b", 0.23),
+    "is none, for is missing": (r"\b(?:is|are) none\b|\bnone where\b", 0.64),
+    "where, for if": (r"\bwhere\b", 5.54),
+}
+"""Words of translated English, and how often they may occur in a thousand words of source and docs."""
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -32,3 +57,43 @@ def test_benchmarks_find_what_they_measure(script):
             module = importlib.import_module(str(node.module))
             for name in node.names:
                 assert hasattr(module, name.name) or importlib.util.find_spec(f"{node.module}.{name.name}"), name.name
+
+
+@pytest.fixture(scope="module")
+def figures():
+    return house(ROOT)
+
+
+@pytest.mark.parametrize("name", MOST)
+def test_the_house_stays_small(figures, name):
+    assert figures[name] <= MOST[name]
+
+
+def prose(path):
+    """Return the text of a page without its code, or the comments and sentences of a module."""
+    text = path.read_text()
+    if path.suffix == ".md":
+        return re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    kinds = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return "\n".join(token.string for token in tokens if token.type in kinds and " " in token.string)
+
+
+@pytest.fixture(scope="module")
+def sentences():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    return "\n".join(prose(path) for path in sorted([*(ROOT / "src").rglob("*.py"), *pages]))
+
+
+@pytest.mark.parametrize("habit", HABITS)
+def test_translated_english_does_not_grow_back(sentences, habit):
+    pattern, most = HABITS[habit]
+    assert 1000 * len(re.findall(pattern, sentences, re.IGNORECASE)) / len(sentences.split()) <= most
+
+
+def test_a_habit_is_found(tmp_path):
+    page, module = tmp_path / "a.md", tmp_path / "a.py"
+    page.write_text("It tells the way.\n```\ntold\n```\n")
+    module.write_text('"""What is beside it."""\nbeside = 1  # a way\n')
+    assert re.findall("tells|told", prose(page)) == ["tells"]
+    assert re.findall("beside|way", prose(module)) == ["beside", "way"]

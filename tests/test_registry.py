@@ -19,5 +19,5 @@ def test_a_package_is_found_once_it_is_installed(tmp_path, monkeypatch):
     (tmp_path / "other-1.dist-info/METADATA").write_text("Name: other\nVersion: 1\n")
     (tmp_path / "other-1.dist-info/entry_points.txt").write_text("[stereovox.sensors]\nother = pathlib:Path\n")
     os.utime(tmp_path, ns=(1, 1))  # another time than before, whatever the clock's steps
-    assert registry.names("sensors", {"own": "a:B"}) == ["own", "other"]
+    assert registry.names("sensors", {"own": "a:B"}) == ["other", "own"]
     assert registry.find("sensors", {}, "other") is sys.modules["pathlib"].Path

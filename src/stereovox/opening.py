@@ -67,7 +67,7 @@ SOURCES = {
     "clouds": "stereovox.sources.clouds.folder:CloudFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
-"""Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
+"""Asked in this order, after those of other packages (entry points in the group `stereovox.sources`)."""
 STREAMS = {"realsense": "stereovox.sources.realsense.realsense:RealSense"}
 """Live cameras, which cannot be rewound; entry points in the group `stereovox.streams`."""
 ROBOTS = {
@@ -75,7 +75,7 @@ ROBOTS = {
     "carmen": "stereovox.sources.robots.carmen:CarmenLog",
     "bag": "stereovox.sources.robots.bag:RobotBag",
 }
-"""Recordings of ground robots, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
+"""Recordings of ground robots, asked in this order, after those of other packages (entry points `stereovox.robots`)."""
 
 
 AMBIGUOUS = (".txt", ".csv", ".bin")

@@ -46,5 +46,5 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
 
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:
-    """Return all names registered in `room`, built-in ones first."""
-    return [*builtin, *(entry.name for entry in entry_points(group=f"stereovox.{room}"))]
+    """Return all names registered in `room`, those of other packages first: their layouts are asked before ours."""
+    return list(dict.fromkeys([*(entry.name for entry in entry_points(group=f"stereovox.{room}")), *builtin]))

@@ -128,9 +128,8 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     parser = _Parser(prog="stereovox", description=stereovox.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    alone = words[:1] if words and not words[0].startswith("-") else []  # the modules of all take long to import
-    chosen = alone or commands()
-    modules = {name: command_module(name) for name in chosen}
+    one = bool(words) and not words[0].startswith("-")  # the modules of all take long to import
+    modules = {words[0]: command_module(words[0])} if one else _all_modules()
     for name, module in modules.items():
         about = str(module.__doc__).strip()
         command = subparsers.add_parser(name, description=about, epilog=f"example: {module.EXAMPLE}")
@@ -171,5 +170,21 @@ def _check_command(words: Sequence[str]) -> None:
 
 
 def command_module(name: str) -> Any:
-    """Return the module of a command."""
-    return import_module(COMMANDS.get(name) or commands()[name])
+    """Return the module of a command. Raises StereovoxError if it is another package's and cannot be imported."""
+    if name in COMMANDS:
+        return import_module(COMMANDS[name])
+    try:
+        return import_module(commands()[name])
+    except ImportError as error:
+        raise StereovoxError(f"the command {name} of another package cannot be imported: {error}") from error
+
+
+def _all_modules() -> dict[str, Any]:
+    """Return the modules of all commands; those of other packages that cannot be imported are noted and left out."""
+    found = {}
+    for name in commands():
+        try:
+            found[name] = command_module(name)
+        except StereovoxError as error:
+            print(f"note: {error}", file=sys.stderr)
+    return found

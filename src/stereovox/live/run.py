@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stereovox.config import Config
 from stereovox.errors import StereovoxError
@@ -24,8 +24,6 @@ from stereovox.live.rig import LiveCamera, read_live
 from stereovox.live.stream import WAIT_S, LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.mavlink.sending import ObstacleSender
-from stereovox.mavlink.stream import MavlinkPoses
 from stereovox.products.floor.floor_axes import Heights
 from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.runs.recording import CHECKPOINT_S, MapRun, Observer, interrupt_between_steps
@@ -33,6 +31,9 @@ from stereovox.runs.warm_up import warm_up
 from stereovox.sources.base import Stream
 from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
+
+if TYPE_CHECKING:
+    from stereovox.mavlink.sending import ObstacleSender
 
 Cameras = str | Path | Stream | LiveCamera | Sequence[str | Path | Stream | LiveCamera]
 PosesFrom = str | PoseStream | LivePoses | None
@@ -297,6 +298,9 @@ class LiveRun:
 
     def _obstacle_sender(self, url: str) -> ObstacleSender:
         """Return what tells an autopilot of obstacles, over the connection that brings its poses if it is the same."""
+        from stereovox.mavlink.sending import ObstacleSender
+        from stereovox.mavlink.stream import MavlinkPoses
+
         poses = self._opened
         if isinstance(poses, MavlinkPoses) and poses.url == url:
             self._open.callback(poses.stop)

@@ -24,7 +24,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 CORPUS = HERE / "corpus"
-PLACES = (HERE, HERE.parent / "tests/sources")
+PLACES = (HERE, HERE.parent / "tests/helpers")
 OWN_SHARE = 20
 """Times that a seed is changed for each time that a file of the corpus is."""
 MAX_KEPT = 10

@@ -112,7 +112,7 @@ def test_frames_looked_at_less_thoroughly_degrade_the_map(monkeypatch):
     monkeypatch.setattr(level, "name", "near")
     monkeypatch.setattr(mapper._deadline, "quality", lambda: level)
     clock.wait(0.1)
-    assert mapper.add(frame()).way == "near"
+    assert mapper.add(frame()).quality == "near"
     health = mapper.health()
     assert (health.state, health.reduced) == ("degraded", {"near": 1})
     assert "1 of 2 frames mapped at reduced quality (1 x near)" in health.text

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 HERE = Path(__file__).resolve().parent
-PLACES = (HERE, HERE.parent / "tests/helpers")
+PLACES = (HERE, HERE.parent / "tests/helpers", HERE.parent / "tests/sources/rgbd")
 MAX_LINE, MAX_SECONDS, MAX_MEMORY = 300, 30, 6 << 30
 RENEWED = 150
 """Calls after which the files are made anew, since commands write over them."""

@@ -55,7 +55,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "room.ply", "room.ply"], "room.ply"),
         (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),
         (["import", "room.ply", "m.yaml"], "room.ply: holds a map in space"),
-        (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map tells"),
+        (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map reports"),
         (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap reports how large its cells are"),
         (["import", "room.svox", "m"], "room.svox"),
         (

@@ -72,7 +72,7 @@ def test_scans_that_are_mostly_lost_are_told_last(command, bag, reference, tmp_p
         for k, one in enumerate(robot.scans)
     ]
     robot.scans = scans
-    monkeypatch.setattr(f"stereovox.cli.{command}.open_noting", lambda source: robot)
+    monkeypatch.setattr(f"stereovox.cli.map.{command}.open_noting", lambda source: robot)
     files = [] if command == "slam" else [reference, "--start=0,0,0"]
     assert main([command, str(bag), *map(str, files), "--out", str(out), "--json"]) == 3
     said = capsys.readouterr()

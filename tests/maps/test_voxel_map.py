@@ -262,7 +262,7 @@ def test_log_odds_that_are_none_are_refused(log_odds):
 def test_blocks_of_another_shape_are_refused():
     voxel_map = VoxelMap(load_config())
     with pytest.raises(StereovoxError, match=r"cells \(1, 5\)"):
-        voxel_map.insert(np.zeros((1, 3), np.int32), np.zeros((1, 5), np.int16))
+        voxel_map.storage.insert(np.zeros((1, 3), np.int32), np.zeros((1, 5), np.int16))
     assert voxel_map.counts() == {"free": 0, "tentative": 0, "occupied": 0}
 
 

@@ -32,7 +32,7 @@ S = 1_000_000_000
 CAMERA = sv.PinholeCamera.from_field_of_view(48, 36, 90.0)
 DOES = ("uses: ", "refuses: ", "carries along: ", "not meaningful, because ")
 SOURCE = Path(sv.__file__).parent
-HOMES = ("products.", "formats", "view.", "viewer.", "mavlink.", "contents", "ros.")
+HOMES = ("products.", "formats", "view.", "viewer.", "mavlink.", "descriptions", "ros.")
 """Rooms whose public names are outputs, but for these:"""
 NO_OUTPUT = {"DirectionRules", "MavlinkLink", "PoseReceiver", "SectorRules", "import_map", "receive_poses"}
 
@@ -282,11 +282,11 @@ def missing_outputs(table):
 def topics():
     """Return the topics of all publishers in the ROS room."""
     found = set()
-    for path in (SOURCE / "ros").glob("*.py"):
+    for path in (SOURCE / "ros").rglob("*.py"):
         tree = ast.parse(path.read_text())
         for call in ast.walk(tree):
             if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "create_publisher":
-                module = import_module(f"stereovox.ros.{path.stem}")
+                module = import_module(".".join(["stereovox", *path.relative_to(SOURCE).with_suffix("").parts]))
                 found |= {f"topic {name}" for name in named(call.args[1], module)}
     return found
 

@@ -211,7 +211,9 @@ print("survived", refused)
 def test_a_long_flight_survives_under_a_limit_of_the_system(when_full):
     """Without `max_memory` it would need 3 KB for each of 100,000 blocks."""
     command = [sys.executable, "-c", LONG_FLIGHT, when_full]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2] / "helpers", capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=Path(__file__).parents[2] / "helpers", capture_output=True, text=True, check=False
+    )
     assert done.stdout.startswith("survived"), done.stderr
 
 

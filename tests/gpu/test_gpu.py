@@ -62,7 +62,7 @@ def test_all_kernels_become_machine_code():
 
 def all_kernels():
     """Return the names of all kernels for cards, from the text of their files."""
-    for path in sorted((HERE.parents[1] / "src/stereovox").rglob("kernels/_gpu.py")):
+    for path in sorted((HERE.parents[1] / "src/stereovox").rglob("_gpu.py")):
         module = ".".join(("stereovox", *path.relative_to(HERE.parents[1] / "src/stereovox").with_suffix("").parts))
         lines = path.read_text().splitlines()
         for before, line in pairwise(lines):

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tests of several rooms need."""
 
+import json
 import signal
 
 import pytest
 from made_bucket import s3, where  # noqa: F401 - fixtures
+
+from stereovox.cli import main
 from made_domains import domains  # noqa: F401 - a fixture
 from xdist.scheduler import WorkStealingScheduling
 
@@ -22,3 +25,16 @@ def obeys_signals():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def told_with_notes(capsys):
+    """Runs a command with `--json` and returns the result and what it said besides."""
+
+    def run(*words):
+        status = main([*map(str, words), "--json"])
+        out, err = capsys.readouterr()
+        assert status == 0, err
+        return json.loads(out.splitlines()[-1]), err
+
+    return run

@@ -77,7 +77,7 @@ for seen in [*(scans(frames) if grid else frames), *others]:
     cameras.add(camera)
     later |= compiled() - allowed
 assert doubted or "deadline_ms" in settings
-print(json.dumps({"ways": dict(mapper.map.history.quality), "cameras": len(cameras), "later": sorted(later)}))
+print(json.dumps({"quality": dict(mapper.map.history.quality), "cameras": len(cameras), "later": sorted(later)}))
 if hasattr(mapper.map, "close"):
     mapper.map.close()
 """

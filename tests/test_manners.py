@@ -58,23 +58,6 @@ def test_maps_complete_to_what_users_want(name):
     assert [name for name in dir(one) if not name.startswith("_")] == USED[name].split()
 
 
-def test_names_of_before_that_pages_show_still_work():
-    one, twin = (sv.VoxelMap.from_cells(sv.load_config(voxel_size=0.1), [[0, 0, 0]], [2.0]) for _ in "ab")
-    twin.insert(*next(one.slabs()))
-    coords, cells = one.blocks_within((-1, -1, -1), (1, 1, 1))
-    assert np.array_equal(coords, [[0, 0, 0]])
-    assert np.array_equal(cells, twin.storage.blocks()[1])
-    twin.listeners.append(print)
-    assert twin.storage.listeners == [print]
-    with pytest.raises(sv.StereovoxError, match="does not keep when cells were seen"):
-        list(one.timed())
-    with pytest.raises(AttributeError, match=r"^'VoxelMap' object has no attribute 'stored'$"):
-        one.stored  # noqa: B018
-    floor = sv.GridMap(sv.load_config(voxel_size=0.1))
-    floor.insert(np.zeros((1, 3), np.int32), np.full((1, 4096), 999, np.int16))
-    assert len(floor.occupied()) == len(floor.storage.tiles()[1][0])
-
-
 def test_the_nearest_obstacle_is_found_however_far_it_is():
     one = sv.VoxelMap.from_cells(sv.load_config(voxel_size=0.1), [[0, 0, 0], [9000, 0, 0]], [-2.0, 2.0])
     assert one.nearest_obstacle([0.05, 0.05, 0.05]).distance == np.float32(900 - 0.05)

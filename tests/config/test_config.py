@@ -202,7 +202,6 @@ def test_up_that_is_no_axis_is_refused_with_the_axes_there_are():
     refused("up", "give x, y, z, -x, -y or -z", up="q")
 
 
-def test_older_names_of_values_still_count():
-    assert load_config("default", **{"depth.far": "told"}).depth.far == "reported"
+def test_unknown_values_are_refused_by_name():
     with pytest.raises(ConfigError, match=r"depth\.far"):
         load_config("default", **{"depth.far": "said"})

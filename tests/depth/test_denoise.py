@@ -10,10 +10,11 @@ from stereovox.depth import prepare
 from stereovox.depth.prepare import denoise
 from stereovox.frame import Frame, Reason
 from stereovox.simulate.d435 import smooth_noise
+from stereovox.track.surfaces import Surfaces
 
 CAMERA = PinholeCamera(64, 48, 415.0, 415.0, 31.5, 23.5, baseline=0.05)
 S2 = 0.08 / (415.0 * 0.05)
-CONFIG = load_config(voxel_size=0.05, min_range=0.2, max_range=6.0)
+CONFIG = load_config(voxel_size=0.05, min_range=0.2, max_range=6.0, **{"depth.keep_lines": True})
 
 
 def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high, apart=1, lines=True):
@@ -137,6 +138,13 @@ def test_same_as_the_slow_one_where_lines_stand_out(correlation_px, apart):
     slow, without = (slow_denoise(depth, 0.0, 0.0, S2, 0.05, 0.2, 6.0, apart, lines) for lines in (True, False))
     assert (slow < without).sum() > 30
     np.testing.assert_allclose(cleaned(depth, config), slow, rtol=2e-5)
+    plain = load_config(config, **{"depth.keep_lines": False})
+    np.testing.assert_allclose(cleaned(depth, plain), without, rtol=2e-5)
+
+
+def test_registration_goes_without_lines():
+    assert CONFIG.depth.keep_lines
+    assert not Surfaces(CONFIG)._depth._config.depth.keep_lines
 
 
 @pytest.mark.parametrize("sigmas", [2.3, 2.6, 3.0])

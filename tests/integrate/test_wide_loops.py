@@ -10,14 +10,14 @@ from machine_code import NEOVERSE_N1, SKYLAKE_512, ZEN_3, arithmetic, listings_a
 LANES = {ZEN_3: 8, SKYLAKE_512: 16, NEOVERSE_N1: 4}
 RAYS = ["stereovox.integrate._ray:cast", "stereovox.integrate._ray:draw"]
 EVALUATE, WEIGH = "stereovox.integrate._projective:evaluate", "stereovox.integrate._hits:weigh"
-SCATTER, DENOISE = "stereovox.integrate._hits:scatter", "stereovox.depth._images:denoise"
+SCATTER, DENOISE = "stereovox.integrate._hits:scatter", "stereovox.depth._denoise:denoise"
 ONE_IMAGE = """
 from made_images import made_image
 from stereovox.config import load_config
 from stereovox.depth.prepare import denoise
 from stereovox.integrate import make_integrator
 
-denoise(made_image(5).depth_m, made_image(5).camera, load_config(voxel_size=0.02))
+denoise(made_image(5).depth_m, made_image(5).camera, load_config(voxel_size=0.02, **{"depth.keep_lines": True}))
 for integrator in ("ray", "line", "projective"):
     make_integrator(load_config(voxel_size=0.1, max_range=2.5, integrator=integrator)).evidence(made_image(5))
 """

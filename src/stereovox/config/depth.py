@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from stereovox.config.base import Section
 
@@ -39,20 +39,18 @@ class DepthConfig(Section):
     """Preparation of a depth image before it becomes evidence.
 
     denoise: average depths that differ by no more than the camera's noise, where that is large against the cells.
+    keep_lines: a line of measured pixels in front of both its sides, such as a rod before a wall, keeps its own mean.
+        Fewer thin things are lost; what moved away clears later (docs/thin.md).
     downsample: n by n pixels become one that holds the smallest valid depth of its block (Chien 2020, 3.2); 1: none.
     far: which pixels count as too far, and so clear cells up to the maximum range. `measured`: only depths measured
-        beyond it; `reported`: also pixels that the source reports as too far (older name: `told`);
+        beyond it; `reported`: also pixels that the source reports as too far;
         `infinite`: also +inf (REP 117), for cameras that never write it for pixels that are too near or unmatched.
     """
 
     denoise: bool = True
+    keep_lines: bool = False
     downsample: int = Field(1, ge=1, le=64)
     far: Literal["measured", "reported", "infinite"] = "reported"
-
-    @field_validator("far", mode="before")
-    @classmethod
-    def _older_name(cls, far: Any) -> Any:
-        return "reported" if far == "told" else far
 
 
 class StereoConfig(Section):

@@ -21,16 +21,17 @@ THREE, FIFTH = np.float32(3), np.float32(0.2)
 
 
 @kernel
-def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings, noisy):
+def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings, noisy, lines):
     """Replace every depth by a weighted mean over neighbours, in place; pixels without value stay as they are.
 
     depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. One pass after another:
     steps: (passes,) int64, ascending, distance of its four neighbours in pixels; fine: noise in metres up to which it
     leaves a pixel unchanged; widths: difference in sigma at which a neighbour no longer counts; limit: cap of sigma,
-    metres. At last lines get their own means (`_lines`) where noise exceeds the last `fine`. low, high: results are
+    metres. At last lines get their own means (`_lines`) if noise exceeds the last `fine`. low, high: results are
     kept within these depths. rings: scratch (passes + 1, passes m + (SIDE + TAPS) steps[0] + 1, w + 2 m), m the
     largest step and w rounded up to SEGMENT: inverse depths of the rows that are needed, measured and after each pass.
-    noisy: scratch (rows of rings, w / SEGMENT) uint8, whether any pixel of a segment takes part in a pass.
+    noisy: scratch (rows of rings, w / SEGMENT) uint8, whether any pixel of a segment takes part in a pass. lines:
+    whether lines get their own means.
     """
     height, passes, rows, margin, apart = depth_m.shape[0], steps.size, rings.shape[1], steps[-1], steps[0]
     rings[:, :, :] = NONE
@@ -54,10 +55,11 @@ def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings, noisy)
         last = v - lag
         if last >= 0:
             _write(rings[passes, last % rows], np.uintp(margin), noise, fine[0], low, high, depth_m[last])
-            _lines(
-                rings, noisy[last % rows], last, apart, np.uintp(margin), noise, fine[passes - 1], low, high,
-                depth_m[last],
-            )  # fmt: skip
+            if lines:
+                _lines(
+                    rings, noisy[last % rows], last, apart, np.uintp(margin), noise, fine[passes - 1], low, high,
+                    depth_m[last],
+                )  # fmt: skip
 
 
 @cell

@@ -119,7 +119,8 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     it then clears its cells. So at last a pixel takes the mean of a line of five measured pixels (upright, level or
     slanting) where that is nearer, and both halves of the line stand 1.5 sigma before what is on both sides: three
     pixels on, after all passes. Noise alone does so at one pixel in a thousand. This is left out up to three times
-    FINE cells of noise, as the last pass is.
+    FINE cells of noise, as the last pass is, and unless `depth.keep_lines` is set: registration, where the few pixels
+    that noise puts in front matter more than thin things, goes without.
 
     Limitation: a step of less than about two sigma is smoothed over some pixels.
     """
@@ -238,7 +239,7 @@ def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: C
     noisy = np.empty((rows, width // _denoise.SEGMENT), np.uint8)
     low, high, limit = np.float32(config.min_range), np.float32(config.max_range), np.float32(LIMIT * config.voxel_size)
     sigma, leaves = _numbers(noise, fine)
-    _denoise.denoise(depth_m, sigma, steps, leaves, WIDTHS, limit, low, high, rings, noisy)
+    _denoise.denoise(depth_m, sigma, steps, leaves, WIDTHS, limit, low, high, rings, noisy, config.depth.keep_lines)
 
 
 def stretched(correlation_px: float) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.rigs import VirtualCamera
-from stereovox.config import Config
+from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Frame
@@ -116,7 +116,7 @@ class Surfaces:
     )
 
     def __init__(self, config: Config):
-        self._config, self._depth = config, DepthPipeline(config)
+        self._config, self._depth = config, DepthPipeline(load_config(config, **{"depth.keep_lines": False}))
         self._sigma: PerCamera[VirtualCamera, NDArray[np.float64]] = PerCamera(self._sigma_of)
         self._map, self._elders, self._views, self._learned = SurfelMap(), Elders(), list[View](), 0
         self._photos, self._free = Photos(), 0.0

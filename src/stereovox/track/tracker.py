@@ -525,7 +525,7 @@ def _doubt(fit: Fit, demand: Demand) -> str:
     if fit.known < demand.known:
         return f"{fit.known:.0%} of what it sees is known, {demand.known:.0%} is needed"
     if fit.inlier_share < demand.inlier_share:
-        return f"{fit.usual:.0%} of what is known lies where it should, {demand.usual:.0%} is needed"
+        return f"{fit.inlier_share:.0%} of what is known lies where it should, {demand.inlier_share:.0%} is needed"
     return ""
 
 

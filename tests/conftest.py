@@ -6,10 +6,10 @@ import signal
 
 import pytest
 from made_bucket import s3, where  # noqa: F401 - fixtures
-
-from stereovox.cli import main
 from made_domains import domains  # noqa: F401 - a fixture
 from xdist.scheduler import WorkStealingScheduling
+
+from stereovox.cli import main
 
 
 def pytest_xdist_make_scheduler(config, log):

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import re
 from collections.abc import Iterable
 
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Numbers of the errors of a file that has no room to grow: the disk, a quota or a limit is reached."""
 MAX_WORD_LENGTH = 100
 """Characters of a word that are compared; words from a file may be longer."""
 MAX_LINE_LENGTH = 10_000

@@ -8,7 +8,6 @@ doubted (its `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
 from __future__ import annotations
 
 import argparse
-import errno
 import json
 import os
 import signal
@@ -19,7 +18,7 @@ from itertools import pairwise
 from typing import Any, NoReturn
 
 import stereovox
-from stereovox.errors import StereovoxError, did_you_mean, one_line, printed
+from stereovox.errors import DISK_FULL, StereovoxError, did_you_mean, one_line, printed
 from stereovox.registry import entry_points
 
 GROUPS = {
@@ -61,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(" ".join(str(error).split()), 2, words)
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk
         where = f"{error.filename}: " if error.filename else ""
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        full = error.errno in DISK_FULL
         cure = "what was being written is not complete; remove it, and make room" if full else UNUSABLE
         return _fail(f"{where}{error.strerror or error}; {cure}", 2, words)
     except MemoryError:

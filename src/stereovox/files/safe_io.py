@@ -169,7 +169,7 @@ def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
     """
     with _plain_file(path) as (file, size):
         if size > most:
-            raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
+            raise OSError(errno.EOVERFLOW, f"holds more than {most} bytes, which is too many for such a file")
         return file.read(size)  # read() would allocate whatever size it is given
 
 

@@ -225,7 +225,7 @@ def start_of(seed: int) -> NDArray[np.float64]:
 
 
 def frames_of(scene: Scene, seed: int) -> list[Frame]:
-    """Return the frames of a scene with the poses that the map is reported."""
+    """Return the frames of a scene with the poses that the map is given."""
     random = np.random.default_rng([seed, 77])
     random.uniform(-1, 1, 3)  # of `start_of`
     start = start_of(seed)

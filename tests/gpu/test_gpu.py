@@ -1,4 +1,4 @@
-"""Maps on graphics cards, without one: in numba's simulator, as machine code, and what users are reported."""
+"""Maps on graphics cards, without one: in numba's simulator, as machine code, and what is reported to users."""
 
 import json
 import os

@@ -33,7 +33,7 @@ def walk(count: int) -> list[Frame]:
 @dataclass
 class Told:
     """What the node made of images. wrong_m, stamps_s: of each that was mapped: how far its pose is from the true one,
-    and when it was taken. refused: reasons. lines: what the user was reported, and when."""
+    and when it was taken. refused: reasons. lines: what was reported to the user, and when."""
 
     wrong_m: dict[str, list[float]] = field(default_factory=dict)
     taken_s: dict[str, list[float]] = field(default_factory=dict)

@@ -111,7 +111,7 @@ def test_a_frame_that_tells_of_too_much_is_refused_and_changes_nothing(monkeypat
         assert report.refused == "view_too_large"
         assert f"{20_000 * CELLS:.2g} cells" in report.detail
         assert not len(mapper.map.cells()[0])
-        assert mapper.add(frame_of(camera, far=False, stamp_ns=1)).refused is None, "what is near can be reported"
+        assert mapper.add(frame_of(camera, far=False, stamp_ns=1)).refused is None, "what is near can be mapped"
 
 
 def test_noise_that_reaches_farther_than_can_be_counted():

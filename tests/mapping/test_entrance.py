@@ -51,7 +51,7 @@ def complaints(check: Check, number: int, kind: str, monkeypatch) -> list[str]:
 
 
 def taken_away(function, reason: str):
-    """Return the code of a function without what refuses for `reason`, or for a reason that it is reported."""
+    """Return the code of a function without what refuses for `reason`, or for a reason that it is given."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
 
     class Without(ast.NodeTransformer):

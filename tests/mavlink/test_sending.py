@@ -16,7 +16,7 @@ RULES = SectorRules(max_distance=4.0)
 
 
 class Clock:
-    """A clock that only goes when it is reported."""
+    """A clock that only moves when a test sets it."""
 
     def __init__(self):
         self.ns = 10**12

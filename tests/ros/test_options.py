@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node is reported: by options, by parameters, wrongly."""
+"""What the node is given: by options, by parameters, wrongly."""
 
 import builtins
 import subprocess

@@ -70,7 +70,7 @@ def same_order(corners: NDArray[np.float64], other: NDArray[np.float64]) -> NDAr
 
 
 def read_grey(path: Path) -> NDArray[np.uint8] | None:
-    """Return the (height, width) uint8 image in `path`, None if missing that OpenCV reads."""
+    """Return the (height, width) uint8 image in `path`, None if OpenCV cannot read one."""
     import cv2
     from PIL import Image
 

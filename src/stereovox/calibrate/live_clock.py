@@ -28,7 +28,7 @@ from stereovox.track.tracker import Tracker
 REASON = "clock_doubt"
 """Why images are refused whose clock may be wrong."""
 TELL_NS, REMIND_NS = 300_000_000, 10_000_000_000
-"""How long a doubt lasts until the user is reported, and until the user is reported again."""
+"""How long a doubt lasts until the user is informed, and until the user is informed again."""
 SAME_M, SAME_RAD, SAMPLES = 0.02, np.radians(0.5), 5
 """A body that moves by less between the two times that an image may be of, seen at so many times, rests."""
 BEFORE_NS, AFTER_NS = 500_000_000, 300_000_000

@@ -77,7 +77,7 @@ class Scores(QuickScores):
     cells (p = 0.5 where unobserved); observed_auc, observed_average_precision likewise.
 
     f_score_1, f_score_2: harmonic mean of precision and recall within one cell, and within two, over all cells.
-    balanced: the point of `curve` if the lesser of precision and recall within the tolerance is largest.
+    balanced: the point of `curve` where the lesser of precision and recall within the tolerance is largest.
     ece_likely: as `ece`, over cells with p >= 0.3; ece_equal_mass: in bins of as many cells.
     decisions: what the map itself decides, at its own thresholds; parts: the same by range (from the path given, or the
     map's own), thickness and looks (where the map holds its camera's path).

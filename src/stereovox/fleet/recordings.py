@@ -7,7 +7,6 @@ boxes each sees, and the history of the map that they made. The key is made of a
 
 from __future__ import annotations
 
-import errno
 import glob
 import hashlib
 import io
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import load_config
 from stereovox.correct.remap import remap
-from stereovox.errors import MapFileError, StereovoxError, one_line
+from stereovox.errors import DISK_FULL, MapFileError, StereovoxError, one_line
 from stereovox.files.places import Bucket, Folder, NoBucketError, Place, is_url
 from stereovox.files.safe_io import sealed, unsealed
 from stereovox.frame import Cloud, Frame
@@ -171,7 +170,7 @@ def why_not(recording: Recording, error: Exception, folder: Path) -> str:
     if isinstance(error, MemoryError):
         return "there is too little memory for it; go on with --resume and fewer --workers"
     if isinstance(error, OSError):
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno in DISK_FULL:
             raise error
         what = _named(str(error.filename or recording.where), recording, folder)
         return f"{what}: {error.strerror or error}; check that you may read it"
@@ -279,9 +278,9 @@ def _all_kept(voxel_map: VoxelMap) -> Sequence[KeptFrame]:
 def _by_frame(
     layout: BoxLayout, frames: Sequence[KeptFrame], told: Sequence[NDArray[np.int64]]
 ) -> list[NDArray[np.int64]]:
-    """Return the boxes that each frame sees, of what a map's listener was reported: nothing if there was no evidence.
+    """Return the boxes that each frame sees, as a map's listener learns them: nothing if there was no evidence.
 
-    It was reported less in cells whose rounding depends on the frame's number, which is another one among recordings.
+    It learned less about cells whose rounding depends on the frame's number, which is another one among recordings.
     """
     if layout.config.map.cell != "int16":
         return [_around(layout, frame) for frame in frames]

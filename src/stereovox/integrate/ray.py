@@ -54,7 +54,7 @@ OVERRUN = 4
 """By how many times a frame may take longer than `deadline_ms`: with more work than that its pixels are made larger.
 Below, the deadline's own levels see to it."""
 STEPS_AT_ONCE, SLOW_STEPS = 20_000_000, 50_000_000
-"""Cells after which Ctrl-C is heard, and from which on a frame is so slow, half a second, that the user is reported."""
+"""Cells after which Ctrl-C is heard, and from which on a frame is so slow, half a second, that the user is warned."""
 
 
 class Ray:

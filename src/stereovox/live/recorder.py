@@ -116,7 +116,7 @@ class Recorder:
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
                 self.failure = f"{self.file}: no image came that could be recorded; nothing is recorded"
-        except Exception as error:  # whatever it is, the user is reported, and nobody waits for this thread
+        except Exception as error:  # whatever it is, the user is informed, and nobody waits for this thread
             why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
             self.failure = f"{why}; {self._left()}"
             self._notify(f"{self.failure}, mapping goes on")

@@ -44,7 +44,7 @@ ones; images that wait, for each camera, and for tracking."""
 TICK_S, SOON_S = 0.1, 0.01
 """Seconds after which a stream without news says so, and after which waiting images are looked at again."""
 REMIND_S = 5.0
-"""Seconds without any pose, with bad lines, or without an image of a camera, until the user is reported."""
+"""Seconds without any pose, with bad lines, or without an image of a camera, until the user is informed."""
 HOST_CLOCK_NS = 60_000_000_000
 """Stamps that are not older than this by the clock of this machine are believed to be by it."""
 REMEMBERED = 300
@@ -66,7 +66,7 @@ class Moment(NamedTuple):
 class _Feed:
     """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more.
 
-    heard_ns: when its last image came, or it was started; monotonic. told: what the user was reported last that is
+    heard_ns: when its last image came, or it was started; monotonic. told: what was last reported to the user that is
     wrong. clock: what watches its clock, where poses do not come with images.
     """
 

@@ -178,7 +178,7 @@ class ObstacleSender:
             why = self._send()
         except (
             Exception
-        ) as error:  # whatever is wrong, nothing is sent, the user is reported, and the next try may succeed
+        ) as error:  # whatever is wrong, nothing is sent, the user is informed, and the next try may succeed
             why = f"{type(error).__name__}: {error}" if not isinstance(error, StereovoxError) else str(error)
         if bool(why) != bool(self._why):
             self._tell(f"no obstacle distances are sent: {why}" if why else "obstacle distances are sent again")

@@ -56,7 +56,7 @@ class RealisticDepthCamera(D435):
     edge_px: within so many pixels of a step in depth a pixel is lost (share `edge_loss`) or measures something
         between (share `flying`).
     holes: share of pixels without value anywhere; with it come `holes_far` at `farthest`, less before as the square of
-        the depth, `holes_steep` where surfaces are seen from the side, `holes_dark` if they are black.
+        the depth, `holes_steep` where surfaces are seen from the side, `holes_dark` where they are black.
     hole_px: standard deviation of the Gaussian that makes holes patchy.
     repetitive: share of the surfaces whose texture repeats each `period` metres; `mismatched`: share of their far
         pixels whose disparity is too large by that period: they seem too near.

@@ -141,7 +141,7 @@ def ghosts(source: PasserBy, frames: list[Frame] | None = None, **settings: Any)
 
 
 def passed_cells(side: float) -> NDArray[np.int32]:
-    """Return the indices (N, 3) of all cells with sides `side` if the person passes, or its noise may be."""
+    """Return the indices (N, 3) of all cells with sides `side` where the person passes, or its noise may be."""
     deep, half = WIDE / 2 + NOISE, WALK_FROM + WIDE
     low, high = (WALK_X - deep, -half, 2 * side), (WALK_X + deep, half, TALL + NOISE)  # the floor stays
     axes = [np.arange(np.floor(a / side), np.ceil(b / side)) for a, b in zip(low, high, strict=True)]

@@ -112,7 +112,7 @@ def test_uncertainty_by_monte_carlo(camera, aligned):
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_range_noise_is_the_uncertainty_in_the_middle(name):
-    """Valenti 2018, Eq 6.9 and 6.10 to 6.11: what the sensor models are reported is Eq 4.2 and 4.7 at u = u0."""
+    """Valenti 2018, Eq 6.9 and 6.10 to 6.11: what the sensor models are given is Eq 4.2 and 4.7 at u = u0."""
     fine = {
         "pinhole": PinholeCamera(3, 1, 500.0, 500.0, 1.0, 0.0, 0.1),
         "spherical": SphericalCamera(3, 1, 2.5 / 1200, 2.5 / 1200, 1.0, 0.0, 0.1),

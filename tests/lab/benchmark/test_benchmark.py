@@ -34,7 +34,7 @@ CAMERA = sv.PinholeCamera(12, 9, 9.0, 9.0, 5.5, 4.0)
 
 
 class Oracle:
-    """A peer that needs no library and says of two cells what its class is reported."""
+    """A peer that needs no library and says of two cells what its class was given."""
 
     occupied_above, about, package = 0.6, "as told", "numpy"
     told = ((0, 0, 0), 2.0), ((1, 0, 0), -2.0)

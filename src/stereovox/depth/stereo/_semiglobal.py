@@ -44,7 +44,7 @@ NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), n
 
 
 class Settings(NamedTuple):
-    """What `match` is reported, in whole numbers.
+    """What `match` is given, in whole numbers.
 
     radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of
     grey between both pixels. unique: per cent by which the second best match must be worse. left_right: most by which

@@ -18,7 +18,7 @@ UNIT_NS = 10_000_000
 """Times are kept in steps of 10 ms."""
 FIRST, LAST = 1 << 30, (1 << 32) - 1
 """The number of the time of the map's first frame; the largest there is. 124 days before and 373 days after the first
-frame can be reported; what lies farther off counts as just so far."""
+frame can be stored; what lies farther off counts as just so far."""
 NEVER = int(_times.NEVER)
 LATE = 8
 """A cell is forgotten at most `forget_s` / LATE after its time is over."""

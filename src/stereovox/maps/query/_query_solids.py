@@ -13,7 +13,7 @@ from stereovox.maps.query._query import LATELY, NOWHERE, cells_from_zero, level_
 
 UNKNOWN_LEVEL, WORST_LEVEL = np.int32(0), np.int32(2)
 SLACK = 1e-9
-"""Blocks that much farther off are asked for too: what touches is reported cell by cell."""
+"""Blocks that much farther off are asked for too: what touches is decided cell by cell."""
 ZERO, ONE, EVERY_ROW = np.uint64(0), np.uint64(1), np.uint64(0x0101010101010101)
 
 

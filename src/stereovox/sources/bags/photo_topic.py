@@ -78,7 +78,7 @@ class PhotoTopic:
 def find_photos(file: BagFile, depth: DepthTopic, transforms: Callable[[], Tf | None]) -> PhotoTopic | None:
     """Return the pictures to which depth images are registered, else those of a camera that is fixed next to theirs.
 
-    None if missing whose camera and place are known. Infrared images are left out.
+    None if there are no pictures whose camera and place are known. Infrared images are left out.
 
     transforms: reads those of the recording; called where they are needed.
     """

@@ -76,7 +76,7 @@ class ClockDoubt:
         start: Whether it was so from the first image on.
         announced: Whether a stamp went back.
         became: OPEN, GONE, LATE or CLOCK.
-        told: Whether the user was reported.
+        told: Whether the user was informed.
     """
 
     off_ns: int

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from stereovox import registry
+from stereovox import cli, registry
 from stereovox.errors import ConfigError
 
 
@@ -21,3 +21,20 @@ def test_a_package_is_found_once_it_is_installed(tmp_path, monkeypatch):
     os.utime(tmp_path, ns=(1, 1))  # another time than before, whatever the clock's steps
     assert registry.names("sensors", {"own": "a:B"}) == ["other", "own"]
     assert registry.find("sensors", {}, "other") is sys.modules["pathlib"].Path
+
+
+@pytest.mark.parametrize("order", [["bench", "explore", "own"], ["own", "explore", "bench"]])
+def test_the_order_of_installed_files_changes_no_list(tmp_path, monkeypatch, order):
+    """Installers write entry points in any order; help and reference pages stay the same."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "other-1.dist-info").mkdir()
+    (tmp_path / "other-1.dist-info/METADATA").write_text("Name: other\nVersion: 1\n")
+    for group in ("commands", "layouts"):
+        lines = "\n".join(f"{name} = other:{name}" for name in order)
+        with (tmp_path / "other-1.dist-info/entry_points.txt").open("a") as file:
+            file.write(f"[stereovox.{group}]\n{lines}\n")
+    os.utime(tmp_path, ns=(order.index("own"), 1))
+    assert registry.names("layouts", {}) == ["bench", "explore", "own"]
+    others = [name for name in cli.commands() if name not in cli.COMMANDS]
+    assert others == sorted(others)
+    assert "own" in others

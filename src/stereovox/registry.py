@@ -47,4 +47,4 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:
     """Return all names registered in `room`, those of other packages first: their layouts are asked before ours."""
-    return list(dict.fromkeys([*(entry.name for entry in entry_points(group=f"stereovox.{room}")), *builtin]))
+    return list(dict.fromkeys([*sorted(entry.name for entry in entry_points(group=f"stereovox.{room}")), *builtin]))

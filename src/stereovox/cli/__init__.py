@@ -151,9 +151,9 @@ def _grouped(modules: Mapping[str, Any]) -> str:
 
 
 def commands() -> dict[str, str]:
-    """Return the module of each command by its name: the built-in ones, then those of other packages."""
+    """Return the module of each command by its name: the built-in ones, then those of other packages by name."""
     others = {entry.name: entry.value for entry in entry_points(group="stereovox.commands")}
-    return COMMANDS | {name: module for name, module in others.items() if name not in COMMANDS}
+    return COMMANDS | {name: others[name] for name in sorted(others) if name not in COMMANDS}
 
 
 def _check_command(words: Sequence[str]) -> None:

@@ -2,6 +2,7 @@
 """What tests of several rooms need."""
 
 import json
+import os
 import signal
 
 import pytest
@@ -15,6 +16,14 @@ from stereovox.cli import main
 def pytest_xdist_make_scheduler(config, log):
     """Give each worker neighbouring tests, so that what the tests of a file share is made once and not by each."""
     return WorkStealingScheduling(config, log)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_disks():
+    """No test turns the power off, so none waits until files lie on the disk; a file must be open all the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: os.fstat(file if isinstance(file, int) else file.fileno()) and None)
+        yield
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What Python users expect: names that complete, types that are found, objects that say what is in them."""
 
+from functools import cache
 from importlib.resources import files
 
 import numpy as np
@@ -66,41 +67,57 @@ def test_the_nearest_obstacle_is_found_however_far_it_is():
 
 
 FLAT, DEEP, FLOOR = np.zeros((4, 2)), np.zeros((4, 3)), sv.load_config(voxel_size=0.1)
-SPACE = sv.VoxelMap.from_cells(FLOOR, [[0, 0, 0]], [-2.0])
-FIELD = sv.DistanceField(SPACE, (0, 0, 0), (1, 1, 1))
 PICTURE = sv.OccupancyGrid(np.zeros((4, 5), np.int8), 0.1)
-GRID, EYE = sv.GridMap(FLOOR), np.eye(3)
+EYE = np.eye(3)
 CAMERA = sv.PinholeCamera(4, 3, 2.0, 2.0, 1.5, 1.0)
+
+
+@cache
+def space():
+    """Not made when tests are collected: that would compile it in each worker."""
+    return sv.VoxelMap.from_cells(FLOOR, [[0, 0, 0]], [-2.0])
+
+
+@cache
+def grid():
+    return sv.GridMap(FLOOR)
+
+
+@cache
+def field():
+    return sv.DistanceField(space(), (0, 0, 0), (1, 1, 1))
+
+
 MISSHAPEN = {
     "points are (4, 2) float64; give (N, 3) metres": [
-        lambda: SPACE.log_odds(FLAT),
-        lambda: SPACE.probability(FLAT),
-        lambda: SPACE.state(FLAT),
-        lambda: SPACE.age(FLAT),
-        lambda: SPACE.nearest_obstacle(FLAT),
-        lambda: FIELD.distance(FLAT),
-        lambda: FIELD.gradient(FLAT),
+        lambda: space().log_odds(FLAT),
+        lambda: space().probability(FLAT),
+        lambda: space().state(FLAT),
+        lambda: space().age(FLAT),
+        lambda: space().nearest_obstacle(FLAT),
+        lambda: field().distance(FLAT),
+        lambda: field().gradient(FLAT),
     ],
     "points are (4, 3) float64; give (N, 2) metres": [
-        lambda: GRID.log_odds(DEEP),
-        lambda: GRID.probability(DEEP),
-        lambda: GRID.state(DEEP),
+        lambda: grid().log_odds(DEEP),
+        lambda: grid().probability(DEEP),
+        lambda: grid().state(DEEP),
         lambda: PICTURE.indices(DEEP),
     ],
-    "origins are (4, 2) float64; give (N, 3) metres": [lambda: SPACE.cast_rays(FLAT, DEEP, 1.0)],
-    "directions are (4, 2) float64; give (N, 3)": [lambda: SPACE.cast_rays(DEEP, FLAT, 1.0)],
-    "low is (4, 2) float64; give (N, 3) metres": [lambda: SPACE.check_boxes(FLAT, DEEP)],
-    "end is (4, 2) float64; give (N, 3) metres": [lambda: SPACE.check_capsules(DEEP, FLAT, 0.1)],
-    "radius is (4, 2) float64; give (N,) metres, or one": [lambda: SPACE.check_capsules(DEEP, DEEP, FLAT)],
+    "origins are (4, 2) float64; give (N, 3) metres": [lambda: space().cast_rays(FLAT, DEEP, 1.0)],
+    "directions are (4, 2) float64; give (N, 3)": [lambda: space().cast_rays(DEEP, FLAT, 1.0)],
+    "low is (4, 2) float64; give (N, 3) metres": [lambda: space().check_boxes(FLAT, DEEP)],
+    "end is (4, 2) float64; give (N, 3) metres": [lambda: space().check_capsules(DEEP, FLAT, 0.1)],
+    "radius is (4, 2) float64; give (N,) metres, or one": [lambda: space().check_capsules(DEEP, DEEP, FLAT)],
     "indices are (4, 2) float64; give (N, 3) whole": [
-        lambda: SPACE.centers(FLAT),
+        lambda: space().centers(FLAT),
         lambda: sv.VoxelMap.from_cells(FLOOR, FLAT, np.zeros(4)),
     ],
     "log_odds are (5,) float64; give (4,)": [lambda: sv.VoxelMap.from_cells(FLOOR, DEEP, np.zeros(5))],
-    "low is (2,) int64; give (3,) metres": [lambda: sv.DistanceField(SPACE, (0, 0), (1, 1))],
-    "size is (2,) int64; give (3,) metres": [lambda: sv.DistanceField(SPACE, size=(1, 1))],
-    "start is (2,) int64; give (3,) metres": [lambda: sv.frontiers(SPACE, start=(0, 1))],
-    "waypoints are (4, 2) float64; give (N, 3)": [lambda: sv.check_path(SPACE, FLAT, 0.1)],
+    "low is (2,) int64; give (3,) metres": [lambda: sv.DistanceField(space(), (0, 0), (1, 1))],
+    "size is (2,) int64; give (3,) metres": [lambda: sv.DistanceField(space(), size=(1, 1))],
+    "start is (2,) int64; give (3,) metres": [lambda: sv.frontiers(space(), start=(0, 1))],
+    "waypoints are (4, 2) float64; give (N, 3)": [lambda: sv.check_path(space(), FLAT, 0.1)],
     "origin is (2,) float64; give (3,)": [
         lambda: sv.GridMap(FLOOR, (1.0, 2.0)),
         lambda: sv.OccupancyGrid(PICTURE.cells, 0.1, (1.0, 2.0)),

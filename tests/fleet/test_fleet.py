@@ -49,8 +49,8 @@ def scheduler():
 
 @pytest.fixture
 def mapped(scheduler):
-    """Return `map_fleet` on that cluster, with boxes of 3.2 m."""
-    return partial(map_fleet, **SETTINGS, box_m=3.2, scheduler=scheduler)
+    """Return `map_fleet` on that cluster, with boxes of 6.4 m."""
+    return partial(map_fleet, **SETTINGS, box_m=6.4, scheduler=scheduler)
 
 
 def of_all(*recordings, **settings):
@@ -89,7 +89,7 @@ def test_clouds_and_depth_images_of_several_machines_make_one_map(mapped, tmp_pa
     assert_same(mapped(both, tmp_path / "m.svox").map.storage.blocks(), of_all(*both))
 
 
-@pytest.mark.parametrize("box_m", [3.2, 4.8, 12.8])
+@pytest.mark.parametrize("box_m", [4.8, 12.8])  # killed workers map boxes of 3.2 m
 def test_the_map_does_not_depend_on_the_boxes(mapped, tmp_path, box_m):
     made = mapped([recording(1), recording(2)], tmp_path / "m.svox", box_m=box_m)
     assert_same(made.map.storage.blocks(), of_all(recording(1), recording(2)))
@@ -176,20 +176,20 @@ def test_boxes_that_are_gone_are_mapped_again(mapped, tmp_path, monkeypatch):
     """A box of the map that was removed, and word of a box that was swept since."""
     monkeypatch.setattr(pyramid, "SMALL", 100)
     where = tmp_path / "m.svox"
-    made, place = mapped([recording(1)], where, box_m=6.4), Place.of(where)
+    made, place = mapped([recording(1)], where), Place.of(where)
     levels = made.map.manifest.levels
     assert sum(map(len, levels)) > 1
     gone = made.map.manifest.boxes[2], levels[0][0]
     for entry in gone:
         place.remove(place.names(f"{entry.name}/cells/"))
-    again = mapped([recording(1)], where, box_m=6.4, resume=True)
+    again = mapped([recording(1)], where, resume=True)
     assert (again.boxes[1], again.map.manifest.levels) == (1, levels)
     assert_same(sv.load_map(where).storage.blocks(), alone(recording(1)).storage.blocks())
     inputs = next(name for name, box in made.map.manifest.extra["fleet"]["boxes"].items() if box == gone[0].box)
     word = json.dumps(boxes.saved(boxes.DoneBox(gone[0]._replace(name=f"{gone[0].name[:-16]}{16 * '0'}"), 1.0)))
     place.remove(["manifest.json", *place.names(f"{gone[0].name}/")])
     place.write(f"done/{inputs}.json", word.encode())
-    assert mapped([recording(1)], where, box_m=6.4, resume=True).boxes[1] == made.boxes[0]
+    assert mapped([recording(1)], where, resume=True).boxes[1] == made.boxes[0]
     assert_same(sv.load_map(where).storage.blocks(), alone(recording(1)).storage.blocks())
 
 
@@ -264,14 +264,14 @@ def test_what_kills_workers_is_named(scheduler):
 
 @pytest.mark.parametrize("kind", ["seen.npy", "manifest.json", "frames-*"])
 def test_damage_of_what_is_kept_is_told_with_the_cure(mapped, tmp_path, kind):
-    mapped([recording(1)], tmp_path / "m.svox", box_m=6.4)
+    mapped([recording(1)], tmp_path / "m.svox")
     (tmp_path / "m.svox/manifest.json").unlink()
     for file in (tmp_path / "m.svox/recordings").glob(f"*/{kind}"):
         file.write_bytes(file.read_bytes()[:-9] if kind == "frames-*" else b"")
     with pytest.raises(MapFileError, match=r"recordings/\w+: is damaged [^;]*; remove it and run again with --resume"):
-        mapped([recording(1)], tmp_path / "m.svox", box_m=6.4, resume=True)
+        mapped([recording(1)], tmp_path / "m.svox", resume=True)
     shutil.rmtree(tmp_path / "m.svox/recordings")
-    mapped([recording(1)], tmp_path / "m.svox", box_m=6.4, resume=True)
+    mapped([recording(1)], tmp_path / "m.svox", resume=True)
     assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
 
 
@@ -460,13 +460,13 @@ def test_a_map_is_gone_on_with_as_it_was_made(mapped, scheduler, tmp_path):
     made = mapped([recording(1)], tmp_path / "m.svox")
     again = map_fleet([recording(1)], tmp_path / "m.svox", resume=True, scheduler=scheduler)
     assert again.boxes == (made.boxes[0], 0)
-    for other in ({"voxel_size": 0.1}, {"box_m": 6.4}):
+    for other in ({"voxel_size": 0.1}, {"box_m": 3.2}):
         with pytest.raises(MapFileError, match="made with other settings"):
             mapped([recording(1)], tmp_path / "m.svox", resume=True, **other)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fleet, "survey", None)  # another first recording may suggest other settings
         both = [recording(2), recording(1)]
-        map_fleet(both, tmp_path / "m.svox", resume=True, scheduler=scheduler, box_m=3.2, voxel_size=0.2)
+        map_fleet(both, tmp_path / "m.svox", resume=True, scheduler=scheduler, box_m=6.4, voxel_size=0.2)
     (tmp_path / "m.svox/fleet.json").write_text("{}")
     with pytest.raises(MapFileError, match=r"fleet\.json: is damaged"):
         mapped([recording(1)], tmp_path / "m.svox", resume=True)

@@ -3,6 +3,7 @@
 
 import logging
 import urllib.request
+from functools import cache
 from uuid import uuid4
 
 import pytest
@@ -12,13 +13,16 @@ import pytest
 def s3():
     """Return the name of a bucket (`s3://...`) on a server in this process; the usual variables name it."""
     pytest.importorskip("obstore")
-    server_of = pytest.importorskip("moto.server").ThreadedMotoServer
+    moto = pytest.importorskip("moto.server")
+    dispatcher = moto.DomainDispatcherApplication
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
-    server = server_of(ip_address="127.0.0.1", port=0, verbose=False)
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
     url = f"http://{host}:{port}"
     with pytest.MonkeyPatch.context() as patch:
+        # It lists all its modules for each request.
+        patch.setattr(dispatcher, "get_backend_for_host", cache(dispatcher.get_backend_for_host))
         for name, value in {
             "AWS_ENDPOINT_URL": url, "AWS_ALLOW_HTTP": "true", "AWS_REGION": "us-east-1",
             "AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "NO_PROXY": "*",

@@ -85,10 +85,10 @@ def test_stereo_recordings_without_poses(tmp_path, name):
 class Camera:
     """A live camera."""
 
-    name, camera, notes, layout, length, dropped = "live", room(1)[0].camera, (), "", None, 0
+    name, notes, layout, length, dropped = "live", (), "", None, 0
 
     def __init__(self, posed):
-        self.posed = posed
+        self.posed, self.camera = posed, room(1)[0].camera
 
 
 @pytest.mark.parametrize("posed", [True, False])

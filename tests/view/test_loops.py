@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The picture of loop closure shows both ways, the loops where they are, reasons, and the map before and after."""
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -48,7 +49,14 @@ def map_of(wall_y, up="z"):
     return voxel_map
 
 
-BEFORE_MAP, AFTER_MAP = map_of([1.0, 1.8]), map_of([1.0])
+@cache
+def before_map():
+    return map_of([1.0, 1.8])
+
+
+@cache
+def after_map():
+    return map_of([1.0])
 
 
 def titles(figure):
@@ -79,7 +87,7 @@ def words(figure):
 
 def test_both_ways_and_the_loops_are_where_they_are():
     closure = closure_of([(0, 8), (1, 7)], [(2, 6)])
-    axis = panel(loops_figure(closure, AFTER_MAP, BEFORE_MAP), "way from above")
+    axis = panel(loops_figure(closure, after_map(), before_map()), "way from above")
     ways = {line.get_color(): line.get_xydata() for line in axis.lines if len(line.get_xydata()) == FRAMES}
     np.testing.assert_allclose(ways[BEFORE], closure.T_world_before[:, :2, 3])
     np.testing.assert_allclose(ways[AFTER], closure.T_world_sensor[:, :2, 3])
@@ -89,7 +97,7 @@ def test_both_ways_and_the_loops_are_where_they_are():
 
 
 def test_a_wall_that_stood_twice_stands_once():
-    figure = loops_figure(closure_of([(0, 8), (1, 7)]), AFTER_MAP, BEFORE_MAP)
+    figure = loops_figure(closure_of([(0, 8), (1, 7)]), after_map(), before_map())
     before, after = panel(figure, "before"), panel(figure, "after")
     assert (walls(before), walls(after)) == (2, 1)
     np.testing.assert_allclose(segments(before, CLOSED)[0], [[0, 0], [0, 1]])
@@ -97,7 +105,7 @@ def test_a_wall_that_stood_twice_stands_once():
 
 
 def test_it_looks_near_where_two_places_were_most_off():
-    figure = loops_figure(closure_of([(1, 7), (0, 8), (3, 5)]), AFTER_MAP, BEFORE_MAP)
+    figure = loops_figure(closure_of([(1, 7), (0, 8), (3, 5)]), after_map(), before_map())
     for name in ("before", "after"):
         low, high = panel(figure, name).get_xlim()
         assert (low + high) / 2 == pytest.approx(0.0)
@@ -108,7 +116,7 @@ def test_it_looks_near_where_two_places_were_most_off():
 
 def test_numbers_and_reasons_are_said():
     refused = [(0, n) for n in range(1, LISTED + 3)]
-    figure = loops_figure(closure_of([(0, 8), (1, 7)], refused), AFTER_MAP, BEFORE_MAP)
+    figure = loops_figure(closure_of([(0, 8), (1, 7)], refused), after_map(), before_map())
     heading, facts = (text.get_text() for text in figure.texts)
     assert heading == "Loop closure: way"
     assert f"2 loops closed, {LISTED + 2} refused" in facts
@@ -122,7 +130,9 @@ def test_numbers_and_reasons_are_said():
 
 
 def test_numbers_at_one_place_do_not_lie_on_each_other():
-    figure = loops_figure(closure_of([(0, 8)], [(0, 2), (1, 2), (3, 2), (4, 2), (5, 6), (7, 6)]), AFTER_MAP, BEFORE_MAP)
+    figure = loops_figure(
+        closure_of([(0, 8)], [(0, 2), (1, 2), (3, 2), (4, 2), (5, 6), (7, 6)]), after_map(), before_map()
+    )
     figure.draw_without_rendering()
     discs = [text.get_bbox_patch().get_window_extent() for text in panel(figure, "way from above").texts]
     assert len(discs) == 6
@@ -130,13 +140,13 @@ def test_numbers_at_one_place_do_not_lie_on_each_other():
 
 
 def test_without_loops_it_says_so_and_shows_no_map():
-    figure = loops_figure(closure_of(refused=[(0, 8)]), AFTER_MAP, BEFORE_MAP)
+    figure = loops_figure(closure_of(refused=[(0, 8)]), after_map(), before_map())
     assert "no loops were found" in figure.texts[1].get_text()
     assert titles(figure) == ["The camera's way from above", ""]
 
 
 def test_the_map_before_may_be_left_out():
-    figure = loops_figure(closure_of([(0, 8)]), AFTER_MAP)
+    figure = loops_figure(closure_of([(0, 8)]), after_map())
     assert "The map in the box, after" in titles(figure)
     assert "The map in the box, before" not in titles(figure)
 
@@ -149,17 +159,17 @@ def test_from_above_is_along_up():
 
 
 def test_nothing_known_there_is_no_mistake():
-    figure = loops_figure(closure_of([(0, 8)]), sv.VoxelMap(sv.load_config()), BEFORE_MAP)
+    figure = loops_figure(closure_of([(0, 8)]), sv.VoxelMap(sv.load_config()), before_map())
     assert not panel(figure, "after").images
 
 
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
 def test_files_are_written(tmp_path, ending):
     file = tmp_path / f"loops.{ending}"
-    loops_picture(closure_of([(0, 8)], [(1, 7)]), AFTER_MAP, file, BEFORE_MAP)
+    loops_picture(closure_of([(0, 8)], [(1, 7)]), after_map(), file, before_map())
     assert file.stat().st_size > 1000
 
 
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(StereovoxError, match=r"\.png, \.pdf or \.svg"):
-        loops_picture(closure_of([(0, 8)]), AFTER_MAP, tmp_path / "loops.gif", BEFORE_MAP)
+        loops_picture(closure_of([(0, 8)]), after_map(), tmp_path / "loops.gif", before_map())

@@ -19,7 +19,7 @@ from numba import cuda
 
 import stereovox as sv
 from stereovox.maps.cells.cell_format import CellRules
-from stereovox.products.side_by_side import side_by_side
+from stereovox.products.block_pairs import block_pairs
 
 FIRST = 10
 
@@ -68,7 +68,7 @@ def differing(a: sv.VoxelMap, b: sv.VoxelMap) -> str:
     """Describe how many cells of two maps differ, and how many of them in their state."""
     states, unknown = CellRules(a.config.map).states, a.storage.cell_format.unknown
     known = numbers = other = 0
-    for _, ours, theirs in side_by_side(a, b):
+    for _, ours, theirs in block_pairs(a, b):
         known += int(((ours != unknown) | (theirs != unknown)).sum())
         numbers += int((ours != theirs).sum())
         other += int((states(ours) != states(theirs)).sum())

@@ -39,8 +39,8 @@ from stereovox.files.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map
 from stereovox.formats.clouds import read_cloud_map
+from stereovox.formats.grid_to_voxels import raised
 from stereovox.formats.map_server import read_map_server, write_map_server
-from stereovox.formats.raised_floor import raised
 from stereovox.formats.read_points import read_npz
 from stereovox.formats.scan_graph import read_scan_graph
 from stereovox.maps import VoxelMap, load_map, save_boxed

@@ -24,10 +24,10 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.record.kept_frames import KeptFrame, KeptFrames
 from stereovox.maps.record.loop_lines import LoopLines
 from stereovox.maps.storage.storage import settings_of_frames
+from stereovox.products.block_pairs import check_alike
 from stereovox.products.merge import merge as added
 from stereovox.products.merge import together
 from stereovox.products.moved import rigid
-from stereovox.products.side_by_side import check_alike
 
 OF_WORLD = {"up", "up_direction", "levelled_from"}
 """Settings that may differ where a transform says how the worlds lie."""

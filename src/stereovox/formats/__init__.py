@@ -28,7 +28,7 @@ IMPORTS = {
     ".npz": "stereovox.formats.read_points:read_npz",
     ".graph": "stereovox.formats.scan_graph:read_scan_graph",
     **dict.fromkeys(CLOUDS, "stereovox.formats.clouds:read_cloud_map"),
-    **dict.fromkeys(FLOORS, "stereovox.formats.raised_floor:read_raised_floor"),
+    **dict.fromkeys(FLOORS, "stereovox.formats.grid_to_voxels:read_raised_floor"),
     ".bag": "stereovox.formats.bags:read_bag_map",
     ".mcap": "stereovox.formats.bags:read_bag_map",
     ".db3": "stereovox.formats.bags:read_bag_map",

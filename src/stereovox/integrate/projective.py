@@ -21,7 +21,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _hits, _lanes, _projective, _windows
-from stereovox.integrate.faces import Face, WideCamera, cut, faces_of
+from stereovox.integrate.cube_faces import Face, WideCamera, cut, faces_of
 from stereovox.integrate.views import (
     RIM_SHARE,
     KernelTable,

@@ -12,7 +12,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.pyramid import coarser_config
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.side_by_side import set_times
+from stereovox.products.block_pairs import set_times
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
 """Cells (N, 3); and (N,) the number of known cells in each, the largest value these store, their latest time."""

@@ -11,7 +11,7 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.storage.storage import EVERYWHERE
-from stereovox.products.side_by_side import add_blocks
+from stereovox.products.block_pairs import add_blocks
 
 
 @one_state

@@ -14,8 +14,8 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
+from stereovox.products.block_pairs import block_pairs, check_alike, in_memory
 from stereovox.products.moved import moved
-from stereovox.products.side_by_side import check_alike, in_memory, side_by_side
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
     before, after = CellRules(a.config.map), CellRules(b.config.map)
     found = []
     counts = np.zeros(len(State) ** 2, np.int64)
-    for coords, cells_a, cells_b in side_by_side(a, b):
+    for coords, cells_a, cells_b in block_pairs(a, b):
         pairs = before.states(cells_a) * len(State) + after.states(cells_b)
         counts += np.bincount(pairs.ravel(), minlength=len(counts))
         found.append([cells_where(coords, pairs, chosen)[0] for chosen in _kinds(pairs)])

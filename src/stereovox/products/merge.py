@@ -17,8 +17,8 @@ from stereovox.maps.cells.cell_times import LAST, NEVER, UNIT_NS
 from stereovox.maps.record.camera_path import CameraPath
 from stereovox.maps.record.history import MAX_REASONS, OTHERS, History
 from stereovox.maps.storage.blocks import CELLS
+from stereovox.products.block_pairs import cells_at, check_alike, in_memory
 from stereovox.products.moved import moved
-from stereovox.products.side_by_side import cells_at, check_alike, in_memory
 
 
 @one_state

@@ -45,9 +45,9 @@ from stereovox.runs.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, po
 from stereovox.runs.survey import LEVELLED, TILTED, level_start, survey
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.turned import Turned
+from stereovox.track.gaps import LostSpans, TrackingGap
 from stereovox.track.guided import GuidedTracker
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.spans import LostSpans, TrackingGap
 from stereovox.track.stream import AnyTracker, TrackedStream
 from stereovox.track.tracker import Tracker
 
@@ -403,7 +403,7 @@ class MapRun:
         return closure
 
     def _believed(self) -> int:
-        return sum(tracker.believed for tracker in self._trackers[-1:] if isinstance(tracker, GuidedTracker))
+        return sum(tracker.prior_only_frames for tracker in self._trackers[-1:] if isinstance(tracker, GuidedTracker))
 
     def _imu_use(self) -> str:
         return "".join(tracker.imu_use for tracker in self._trackers[-1:] if isinstance(tracker, Tracker))

@@ -30,8 +30,8 @@ from stereovox.sources.base import Stream, pose_reader
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS, write_trajectory
+from stereovox.track.gaps import LostSpans, TrackingGap
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.spans import LostSpans, TrackingGap
 from stereovox.track.stream import LOST, follow
 from stereovox.track.tracker import Tracked, Tracker
 

@@ -26,11 +26,11 @@ class GuidedTracker:
         config: Settings by which depth is prepared, as for the map.
 
     Attributes:
-        believed: Number of frames whose own motion was taken as it is, since nothing known was in view.
+        prior_only_frames: Frames placed by their own motion alone, because nothing known was in view.
     """
 
     def __init__(self, config: Config):
-        self.believed = 0
+        self.prior_only_frames = 0
         self._config, self._tracker = config, Tracker(config)
         self._T_world_tracker: Transform | None = None
         self._own: Transform | None = None  # pose of its own of the frame that the tracker stands at
@@ -51,7 +51,7 @@ class GuidedTracker:
             self._at, self._own = tracked.T_world_sensor, own
             if own is None and self._T_world_tracker is not None and not tracked.lost:
                 self._own = self._T_world_tracker @ tracked.T_world_sensor
-        self.believed += tracked.believed
+        self.prior_only_frames += tracked.believed
         if tracked.begins:
             self._begin(own)
         if self._T_world_tracker is None:

@@ -17,6 +17,7 @@ from stereovox.frame import AnyFrame, Frame
 from stereovox.geometry.se3 import Transform
 from stereovox.integrate.views import PerCamera
 from stereovox.sensors.noise import RangeNoise
+from stereovox.track.color_images import PhotoLandmarks, Photos, Sighted, sighted_or_why
 from stereovox.track.fit import (
     LOST,
     Fit,
@@ -29,7 +30,6 @@ from stereovox.track.fit import (
     motion_between,
     solve_stages,
 )
-from stereovox.track.photos import PhotoLandmarks, Photos, Sighted, sighted_or_why
 from stereovox.track.surfels import CONVERGED, Elders, Patches, SurfelMap, beside_planes, patches_of
 from stereovox.track.views import (
     View,

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.storage.cubes import in_cubes
+from stereovox.products.block_pairs import in_memory
 from stereovox.products.floor.floor_axes import MAX_CELLS, floor_axes
 from stereovox.products.neighbours import components
-from stereovox.products.side_by_side import in_memory
 
 TIE = 1e-6
 """Cells: lengths that are so near to whole cells are."""

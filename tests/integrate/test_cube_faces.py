@@ -10,7 +10,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
-from stereovox.integrate import faces
+from stereovox.integrate import cube_faces as faces
 
 CONFIG = load_config()
 KINDS = st.sampled_from([SphericalCamera, CylindricalCamera])

@@ -7,8 +7,8 @@ import pytest
 from stereovox.cli import main
 from stereovox.errors import StereovoxError
 from stereovox.formats import import_map
+from stereovox.formats.grid_to_voxels import raised
 from stereovox.formats.map_server import read_map_server, write_map_server
-from stereovox.formats.raised_floor import raised
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.floor.projection import project

@@ -15,7 +15,7 @@ from stereovox.frame import DepthImage, Photo
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_source
 from stereovox.simulate.scene import Scene, cylinder
-from stereovox.track.photos import PhotoLandmarks, inverse_depths
+from stereovox.track.color_images import PhotoLandmarks, inverse_depths
 from stereovox.track.sightings import Corners, Sightings
 from stereovox.track.tracker import Tracker
 

@@ -27,7 +27,7 @@ def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integ
     return voxel_map.storage.cells_of(coords)
 
 
-def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
+def block_pairs(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
     """Yield every block that one of two maps in memory has, with the cells of both, piece by piece."""
     for coords, cells in a.storage.slabs():
         yield coords, cells, cells_at(b, coords)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a robot's scans fit a map along its track: whether it is the right map and the right place."""
+"""Fit of a robot's scans to a map along its track: a check for the right map and the right place."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ SCANS, BEAMS, RIGID = 60, 60, 5e-3
 
 
 def fit_share(grid: OccupancyGrid, scans: Sequence[Scan], track: Track) -> float | None:
-    """Return the share of beams (0 to 1) that end near an obstacle of the map, over scans spread along the way.
+    """Return the share of beams (0 to 1) that end near an obstacle of the map, over scans spread along the track.
 
-    Beams that met nothing do not count. None if no beam met anything.
+    Beams without a return do not count. None if no beam has a return.
     """
     field = distance_field(_with_rim(grid), 2 * NEAR)
     found = [_distances(field, scans[i], track) for i in _spread(len(scans))]
@@ -35,7 +35,7 @@ def fit_share(grid: OccupancyGrid, scans: Sequence[Scan], track: Track) -> float
 
 
 def _with_rim(grid: OccupancyGrid) -> OccupancyGrid:
-    """Return the map with unknown cells around it: walls at its border have a far side, too."""
+    """Return the map padded with unknown cells, so that walls at its border have a far side too."""
     rim = ceil(NEAR / grid.resolution)
     x, y, yaw = se2.compose(grid.origin, [-rim * grid.resolution, -rim * grid.resolution, 0.0]).tolist()
     return replace(grid, cells=np.pad(grid.cells, rim, constant_values=UNKNOWN), origin=(x, y, yaw))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The track of a ground robot's recording, from SLAM or from localisation in a map, and how well it fits."""
+"""The track of a ground robot's recording, by SLAM or by localisation in a map, and its fit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -
 
     Raises MissingExtra without gtsam, StereovoxError if there are no scans, and as `map_scans`.
     """
-    need_gtsam()  # not after an hour, when the first loop is found
+    need_gtsam()  # now, not after an hour at the first loop
     if not len(robot.scans):
         raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
     try:
@@ -101,17 +101,17 @@ def refused_line(refused: Mapping[str, int], first: str = "") -> str:
 
 
 def doubt_lines(doubts: Sequence[MapDoubt]) -> list[str]:
-    """Return what a user should read about a map by SLAM that may be wrong; empty if nothing speaks against it."""
+    """Return the warnings about a SLAM map that may be wrong; empty if there are none."""
     if not doubts:
         return []
-    return ["warning: this map may be wrong; look at it before you use it", *(f"  {doubt.line()}" for doubt in doubts)]
+    return ["warning: this map may be wrong; inspect it before you use it", *(f"  {doubt.line()}" for doubt in doubts)]
 
 
 def fit_of(robot: Robot, floor: OccupancyGrid, track: Track) -> tuple[float | None, str]:
     """Return the share of beams that fit the map along the track, and a line that states it, with a warning if it is
     low.
 
-    None and "" if no beam met anything.
+    None and "" if no beam has a return.
     """
     fit = fit_share(floor, robot.scans, track)
     if fit is None:

@@ -14,13 +14,13 @@ from stereovox.frame import Scan, name_of
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a scan that say something: hits, and those that met nothing up to `range_max`.
+    """The usable beams of a scan: hits, and beams without a return up to `range_max`.
 
     origin: (2,) float64 x, y of the sensor in the robot's frame.
-    directions: (K, 2) float64, the way a beam goes for each metre of its length, seen from above in the robot's frame.
-        Shorter than one where the sensor is tilted.
-    ranges: (K,) float64 metres; `range_max` if nothing was met.
-    at_max: (K,) bool, reports which met nothing.
+    directions: (K, 2) float64, direction of a beam per metre of its length, seen from above in the robot's frame.
+        Shorter than one if the sensor is tilted.
+    ranges: (K,) float64 metres; `range_max` if there is no return.
+    at_max: (K,) bool, which have no return.
     range_max: metres.
     """
 
@@ -36,7 +36,7 @@ class Beams:
         return self.origin + self.directions * self.ranges[:, None]
 
     def some(self, most: int, hits_only: bool = False) -> Beams:
-        """Return at most so many beams, evenly chosen among all or among those that hit something."""
+        """Return at most `most` beams, evenly chosen from all or from the hits."""
         chosen = np.flatnonzero(~self.at_max) if hits_only else np.arange(len(self.ranges))
         if len(chosen) > most:
             chosen = chosen[np.linspace(0, len(chosen) - 1, most).round().astype(int)]
@@ -48,9 +48,9 @@ class Beams:
 
 
 def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
-    """Return the beams of a scan: NaN, -inf and ranges below `range_min` are ignored, +inf means that nothing was met.
+    """Return the beams of a scan: NaN, -inf and ranges below `range_min` are ignored, +inf means no return.
 
-    max_range: metres beyond which nothing counts as met; None: the scan's own. The scan must be validated
+    max_range: metres beyond which returns do not count; None: the scan's own. The scan must be validated
     (`validate_scan`). Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
     """
     ranges, farthest = np.asarray(scan.ranges, float), _farthest(scan, max_range)

@@ -23,7 +23,7 @@ class Track:
     """A robot's track through a map, and its odometry's drift.
 
     stamps_ns: (N,) int64 nanoseconds, ascending. pose_map_base: (N, 3) float64, the robot in the map. pose_map_odom:
-    (N, 3) float64, from the odometry's poses to those (the `map -> odom` of ROS). refused: scans left out, by reason;
+    (N, 3) float64, from odometry to map (the `map -> odom` of ROS). refused: scans left out, by reason;
     first_refusal: message of the first one. Raises StereovoxError if stamps do not ascend: times between them would
     be looked up wrongly.
     """
@@ -43,7 +43,7 @@ class Track:
             raise StereovoxError(f"the times of a track must rise: {said}; leave out scans that are not in order")
 
     def correction(self, stamp_ns: int) -> se2.Pose:
-        """Return pose_map_odom (3,) at a time: interpolated, and held before the first and after the last."""
+        """Return pose_map_odom (3,) at a time: interpolated, and constant before the first and after the last."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right"))
         if after in (0, len(self.stamps_ns)):
             return np.asarray(self.pose_map_odom[max(after - 1, 0)], float)
@@ -54,14 +54,14 @@ class Track:
         return np.asarray(self.pose_map_odom[before] + share * step, float)
 
     def corrected(self, seen: Posed) -> Posed:
-        """Return a frame or scan whose pose is in the odometry's world with its pose in the map."""
+        """Return a frame or scan in the odometry's world with its pose in the map."""
         T_map_odom = se2.lifted(self.correction(seen.stamp_ns))
         return replace(seen, T_world_sensor=T_map_odom @ seen.T_world_sensor)
 
     def save(self, path: str | Path) -> None:
-        """Write where the robot stood as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
+        """Write the robot's poses as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
 
-        Raises MapFileError if the file cannot be written; an older one is then still there.
+        Raises MapFileError if the file cannot be written; an older file is then kept.
         """
         poses = np.array([se2.lifted(pose) for pose in self.pose_map_base]).reshape(-1, 4, 4)
         write_trajectory(path, self.stamps_ns.tolist(), poses, "robot in the map, on the floor")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that looks which cells of a box became obstacles of a map, or ceased to be."""
+"""Kernel that finds which cells of a box became obstacles of a map, or ceased to be."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ UNKNOWN, BIT = np.int32(_cells.UNKNOWN), np.uint8(1)
 
 @allocating_kernel
 def refresh(stored, rules, wanted, low, order, shape, seen, mask, dirty):
-    """Bring `seen` and `mask` up to date with a map; mark slabs that changed in `dirty`, return how many cells did.
+    """Bring `seen` and `mask` up to date with a map; mark changed slabs in `dirty`, return how many cells changed.
 
-    wanted: (1,) uint8 bits of the states that are obstacles. low: (3,) first cell of the box. order, shape: its axes as
-    those of `mask` (a, b, c) follow each other, and how long they are there. seen: (blocks, 512) uint8, 1 where a cell
+    wanted: (1,) uint8 bits of the states that are obstacles. low: (3,) first cell of the box. order, shape: map axis
+    and length of each axis (a, b, c) of `mask`. seen: (blocks, 512) uint8, 1 if a cell
     was an obstacle; blocks in the order of their coordinates.
     """
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -37,7 +37,7 @@ def refresh(stored, rules, wanted, low, order, shape, seen, mask, dirty):
 
 @cell
 def _find_changes(stored, rules, wanted, x, y, z, now, seen):
-    """Set `now` (512,) to which cells of a block are obstacles; return whether any differs from `seen`."""
+    """Set `now` (512,) to the obstacles among a block's cells; return whether any differs from `seen`."""
     row = row_of(stored, x, y, z)
     differ = np.uint8(0)
     if row < 0:
@@ -57,7 +57,7 @@ def _find_changes(stored, rules, wanted, x, y, z, now, seen):
 
 @cell
 def _enter(now, seen, block, order, shape, mask, dirty):
-    """Enter what differs from `seen` in a block, whose first cell stands at `block` in the box."""
+    """Enter the changes from `seen` of a block whose first cell is at `block` in the box."""
     changed = 0
     for c in range(512):
         if now[c] != seen[c]:

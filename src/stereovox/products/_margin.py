@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that gives blocks a margin of one cell of their neighbours."""
+"""Kernel that pads blocks with one cell of their neighbours."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ SIDE = 8
 
 @kernel
 def with_margin(stored, coords, out):
-    """Write the cells of blocks (n, 3), as stored, to `out` (n, 10, 10, 10), their neighbours' around them."""
+    """Write the cells of blocks (n, 3), as stored, to `out` (n, 10, 10, 10), surrounded by their neighbours' cells."""
     for n in range(coords.shape[0]):
         for dx in range(-1, 2):
             for dy in range(-1, 2):

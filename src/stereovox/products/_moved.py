@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that takes back what cells of a map in a new frame must not say: that all in them is free.
+"""Kernel that withdraws unsafe free cells of a map resampled in a new frame.
 
-A cell of the new frame lies askew among those of the old one. Which of these it overlaps is told by the separating
-axis theorem (Gottschalk, Lin, Manocha 1996, OBBTree): two boxes are apart just where one of 15 directions, the same for
-all cells, tells them apart.
+A cell of the new frame is askew among the cells of the old one. The separating axis theorem finds which of them it
+overlaps (Gottschalk, Lin, Manocha 1996, OBBTree): two boxes are disjoint exactly if one of 15 directions, the same
+for all cells, separates them.
 """
 
 import numpy as np
@@ -15,19 +15,19 @@ from stereovox.maps.query._query import LATELY, NOWHERE, row_again, state_of
 
 UNKNOWN, FREE, TENTATIVE = np.int32(_cells.UNKNOWN), np.int32(_cells.FREE), np.int32(_cells.TENTATIVE)
 SAMPLES = 4
-"""Places in a cell, along each side, that tell how much of it lies in which cells of the old frame."""
+"""Samples along each side of a cell that measure its overlap with cells of the old frame."""
 STEP, HALF, NIL, ONE = np.float32(1 / SAMPLES), np.float32(0.5), np.int32(0), np.int32(1)
 
 
 @allocating_kernel
 def doubt(stored, rules, prior, turn, axes, reach, low, rest, cells):
-    """Change those of `cells` (n, 512) of blocks in the new frame that are free but overlap what is not.
+    """Change the free ones of `cells` (n, 512), blocks in the new frame, that overlap cells that are not free.
 
-    One that overlaps something occupied or tentative becomes tentative; else one that overlaps something unknown does
-    so. stored, rules: of the map in the old frame. turn: (3, 3) float32, what a step of one cell in the new frame is in
-    cells of the old one. axes, reach: (15, 3), (15,) float32: two cells are apart where their middles are, along one of
-    these directions, farther apart than that; in cells of the old frame. low + rest: (n, 3) int32 + float32, where in
-    cells of the old frame the lowest corner of each block lies.
+    A cell that overlaps an occupied or tentative one becomes tentative; else one that overlaps an unknown one becomes
+    unknown. stored, rules: of the map in the old frame. turn: (3, 3) float32, a step of one cell in the new frame in
+    cells of the old one. axes, reach: (15, 3), (15,) float32: two cells are disjoint if, along one of these directions,
+    their centres are farther apart than its reach; in cells of the old frame. low + rest: (n, 3) int32 + float32, the
+    lowest corner of each block in cells of the old frame.
     """
     lately = np.full(LATELY, NOWHERE, np.int32)
     for n in range(cells.shape[0]):
@@ -44,7 +44,7 @@ def doubt(stored, rules, prior, turn, axes, reach, low, rest, cells):
 
 @cell
 def _worst_overlapped(stored, rules, turn, axes, reach, low, rest, x, y, z, lately):
-    """Return TENTATIVE where the cell overlaps one that is at least so, else UNKNOWN where it overlaps one, or FREE."""
+    """Return TENTATIVE if the cell overlaps a tentative or occupied one, else UNKNOWN if it overlaps one, else FREE."""
     worst = FREE
     px, py, pz = _place(turn, rest, x + HALF, y + HALF, z + HALF)
     wx, wy, wz = _half_width(turn, 0), _half_width(turn, 1), _half_width(turn, 2)
@@ -71,7 +71,7 @@ def _overlap(axes, reach, dx, dy, dz):
 
 @cell
 def _rise(stored, prior, turn, low, rest, x, y, z, lately):
-    """Return the evidence for an obstacle on the cells that a cell overlaps, each by its share of the cell."""
+    """Return the evidence for an obstacle in the cells that a cell overlaps, each weighted by its share of it."""
     total = NIL
     for i in range(SAMPLES):
         for j in range(SAMPLES):
@@ -86,7 +86,7 @@ def _rise(stored, prior, turn, low, rest, x, y, z, lately):
 
 @cell
 def _tentative(stored, rules, number):
-    """Return the tentative number nearest to one; unknown, or the lowest that is not free, if there is none."""
+    """Return the tentative number nearest to one; if there is none, unknown or the lowest non-free one."""
     number = max(min(number, np.int32(rules.occupied_least - ONE)), np.int32(rules.free_most + ONE))
     room = number == stored.unknown and number + ONE < rules.occupied_least
     return np.int32(number + (ONE if room else NIL))
@@ -100,7 +100,7 @@ def _number(stored, low, i, j, k, lately):
 
 @cell
 def _place(turn, rest, x, y, z):
-    """Return where a place in a block of the new frame lies, in cells of the old one from the block's `low` on."""
+    """Return a point in a block of the new frame, in cells of the old one relative to the block's `low`."""
     return (
         rest[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
         rest[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,

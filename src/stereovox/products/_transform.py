@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the exact distance transform that redo only what can have changed; see `Transform` for the arrays.
+"""Kernels of the exact distance transform that redo only what may have changed; see `Transform` for the arrays.
 
 Squared distances add up axis by axis: along the rows of a slab by counting cells, along the lanes of a row and across
-the slabs of a plane as the least of `square + cost[cells off]`. A sum whose place changed matters elsewhere only where
-it was or becomes the least: where none does, nothing else is looked at again.
+the slabs of a plane as the minimum of `square + cost[cells off]`. A changed sum matters elsewhere only if it was or
+becomes the minimum: rows for which it does neither are not visited again.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from stereovox.kernels._jit import allocating_kernel, cell
 
 FAR = np.int16(32000)
 FEW = 16
-"""With more lanes changed than that a row is made anew without a test."""
+"""With more changed lanes than this a row is rebuilt without a test."""
 UNCHANGED, INFINITE = np.float32(-1), np.float32(np.inf)
 NO, YES, LARGEST = np.int32(0), np.int32(1), np.int32(2**31 - 1)
 NEAR, ONE = np.int16(0), np.int16(1)
@@ -22,7 +22,7 @@ NEAR, ONE = np.int16(0), np.int16(1)
 def across_slabs(field, costs, lanes, dirty, first, step):
     """Bring `runs` and `partial` up to date in the slabs first, first + step, ... that are `dirty` (slabs,).
 
-    lanes: how many of a row stand for cells; the others pad it. Marks in `touched` what changed.
+    lanes: number of lanes of a row that are cells; the others are padding. Marks changes in `touched`.
     """
     slabs, rows, padded = field.mask.shape
     runs = np.empty((rows, padded), np.int16)
@@ -61,7 +61,7 @@ def across_planes(field, costs, first, step):
 
 @cell
 def _bits(number):
-    """Return a number of 0 or more as an integer of the same order: the largest of many is then found in vectors."""
+    """Return a number of 0 or more as an integer of the same order: the maximum of many then vectorises."""
     return np.float32(number).view(np.int32)
 
 
@@ -72,7 +72,7 @@ def _number(bits):
 
 @cell
 def _count(mask, runs):
-    """Write how many rows off the next obstacle of the same lane is, FAR if there is none."""
+    """Write the distance in rows to the next obstacle of the same lane, FAR if there is none."""
     rows, padded = mask.shape
     for c in range(padded):
         runs[0, c] = NEAR if mask[0, c] else FAR
@@ -100,15 +100,15 @@ def _listed(new, old, lanes, moved):
 
 @cell
 def _square(costs, run):
-    """Return the square that a run along the rows stands for."""
+    """Return the square of a run along the rows."""
     return min(costs.along[run], costs.none) if run < costs.along.size else costs.none
 
 
 @cell
 def _amended(new, old, moved, costs, before, best):
-    """Set `best` to the row `before`, amended for the lanes that moved; return whether that is all there is to do.
+    """Set `best` to the row `before`, amended for the lanes that moved; return whether that suffices.
 
-    It is where no lane that moved away was the nearest of any other.
+    It does if no lane that moved away was the nearest of any other.
     """
     if moved.size > FEW:
         return False
@@ -129,7 +129,7 @@ def _amended(new, old, moved, costs, before, best):
 
 @cell
 def _rebuild(runs, lanes, costs, line, best):
-    """Make a row anew: `line` holds it between two rows of nothing, so that it can be looked at from any lane off."""
+    """Rebuild a row; `line` holds it between two rows without obstacles, so that any offset can be read."""
     padded, middle = best.size, costs.lanes.size // 2
     least, most = LARGEST, NO
     for c in range(lanes):
@@ -145,7 +145,7 @@ def _rebuild(runs, lanes, costs, line, best):
 
 @cell
 def _replace(field, b, a, lanes, best):
-    """Put `best` in the place of a row of `partial`; remember what was less before, and the least that changed."""
+    """Store `best` as a row of `partial`; record earlier values that were smaller, and the least that changed."""
     row, superseded = field.partial[b, a], field.superseded[b, a]
     least, lowest = LARGEST, LARGEST
     for c in range(best.size):
@@ -184,7 +184,7 @@ def _renew(field, costs, b, a, listed, best):
 
 @cell
 def _across(rows, lowest, cost, a, best):
-    """Set `best` to the least of all rows of a plane as seen from row a; return the largest of it as bits."""
+    """Set `best` to the least of all rows of a plane as seen from row a; return its maximum as bits."""
     most = NO
     for c in range(best.size):
         best[c] = rows[a, c]
@@ -203,7 +203,7 @@ def _across(rows, lowest, cost, a, best):
 
 @cell
 def _lower(best, row, cost):
-    """Lower `best` to row + cost where that is less; return the largest of it as bits."""
+    """Lower `best` to row + cost if that is less; return its maximum as bits."""
     most = NO
     for c in range(best.size):
         other = row[c] + cost
@@ -226,7 +226,7 @@ def _lower_by_two(best, row, mirrored, cost):
 
 @cell
 def _lower_unless_missed(best, row, superseded, cost):
-    """Do what `_lower` does, and return whether what is `superseded` from the row may have been the least anywhere."""
+    """Do as `_lower`, and return whether a `superseded` value of the row may have been the minimum anywhere."""
     most, missed = NO, NO
     for c in range(best.size):
         other = row[c] + cost

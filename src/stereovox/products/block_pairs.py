@@ -23,12 +23,12 @@ def in_memory(voxel_map: VoxelMap) -> VoxelMap:
 
 
 def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integer]:
-    """Return the cells (n, 512) as stored of blocks (n, 3) of a map in memory; all unknown where it has no block."""
+    """Return the cells (n, 512) as stored of blocks (n, 3) of a map in memory; all unknown if it has no block."""
     return voxel_map.storage.cells_of(coords)
 
 
 def block_pairs(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
-    """Yield every block that one of two maps in memory has, with the cells of both, piece by piece."""
+    """Yield every block of either of two maps in memory, with the cells of both, piece by piece."""
     for coords, cells in a.storage.slabs():
         yield coords, cells, cells_at(b, coords)
     for coords, cells in b.storage.slabs():
@@ -38,7 +38,7 @@ def block_pairs(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
 
 
 def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
-    """Raise StereovoxError if two maps differ in cell size, or, without a transform, in what is up."""
+    """Raise StereovoxError if two maps differ in cell size, or, without a transform, in their `up`."""
     if T_a_b is None and a.config.up != b.config.up:
         raise StereovoxError(
             f"up is {a.config.up} in one map and {b.config.up} in the other; give the transform between them"

@@ -22,12 +22,12 @@ Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray
 def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     """Merge cells into larger ones.
 
-    A coarse cell has the worst state of its parts: occupied, then tentative, unknown, free. So it is free only where
+    A coarse cell has the worst state of its parts: occupied, then tentative, unknown, free. So it is free only if
     all of them are, and nothing occupied is lost. Its log-odds are the largest of theirs, its time the latest.
 
     Args:
         voxel_map: The map.
-        factor: How many times longer each side becomes; a whole number from 1 on.
+        factor: How many times longer each side becomes; a whole number, 1 or more.
 
     Returns:
         An unbounded map with the history of `voxel_map`.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map says besides its cells, and what each output does with it: nothing leaves a map without an answer to that.
+"""The properties of a map besides its cells, and how each output handles them: every output must have an answer.
 
-`OUTPUTS` is the table. Each cell begins with what is done: `uses` it, `refuses` if it is bad, `carries along` what
-says it, or `not meaningful, because` of something. A test walks the table with a bad case for each cell that uses or
-refuses, and fails for an output that is not in it.
+`OUTPUTS` is the table. Each cell begins with an action: `uses` the property, `refuses` if it is bad, `carries along`
+data that states it, or `not meaningful, because` of a reason. A test checks a bad case for each cell that uses or
+refuses, and fails for an output that is missing in the table.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from stereovox.products.floor.floor_heights import FloorHeights
 
 
 class HasMap(Protocol):
-    """A mapper, or anything with settings that says how old its map is."""
+    """A mapper, or anything with settings that reports how old its map is."""
 
     config: Config
 
@@ -31,15 +31,15 @@ class HasMap(Protocol):
 
 @dataclass(frozen=True)
 class MapContext:
-    """What whoever acts on a map must know besides its cells.
+    """What a user of a map must know besides its cells.
 
     Attributes:
-        world: Name of the frame that coordinates are in.
+        world: Name of the frame of the coordinates.
         up: Unit vector (3,) that points up in it.
-        tilt_deg: Degrees between `up` and the nearest axis of the map, to which layers and columns are square.
-        floor: Height of the floor at each place, or that it is unknown; None: it was not searched for.
-        stamp_ns: Time of the last event that the map shows, by the clock of its stamps; None: of no known time.
-        age_s: Seconds since that event; None: nobody knows, as of a map that was loaded.
+        tilt_deg: Degrees between `up` and the nearest axis of the map, to which layers and columns are aligned.
+        floor: Height of the floor at each place, or unknown; None: it was not searched for.
+        stamp_ns: Time of the last event that the map shows, by the clock of its stamps; None: unknown.
+        age_s: Seconds since that event; None: unknown, as for a loaded map.
         health: Of the mapper; None without one.
         unknown: What an unknown cell means for the output.
     """
@@ -55,12 +55,12 @@ class MapContext:
 
     @property
     def stale(self) -> str:
-        """Why the map is too old to be acted on; "" if it is not, or it is no live map."""
+        """Why the map is too old to act on; "" if it is not, or is no live map."""
         return self.health.text if self.health is not None and self.health.state in STALE else ""
 
 
 def context_of(mapper: HasMap, world: str = "map") -> MapContext:
-    """Return the context of a growing map; its floor is not searched for.
+    """Return the context of a growing map; its floor is not searched.
 
     Args:
         mapper: Its mapper.
@@ -88,7 +88,7 @@ class Leaves(NamedTuple):
 
 
 def nothing(why: str, age: str = "", health: str = "") -> Leaves:
-    """Return that no property has a meaning, but for age and health where they are given."""
+    """Return a row in which no property has a meaning, except age and health if given."""
     none = f"{NO_MEANING}{why}"
     return Leaves(none, none, none, age or none, health or none, none)
 
@@ -166,11 +166,11 @@ OUTPUTS: dict[str, Leaves] = {
     "topic map_error": nothing("it compares two maps of one frame"),
     "topic map": nothing("it is the map that was given, or SLAM's own"),
 }
-"""What each output does with each property: names of `stereovox` (`sv.`), outputs of live runs, formats, ROS topics."""
+"""How each output handles each property: names of `stereovox` (`sv.`), outputs of live runs, formats, ROS topics."""
 
 
 def table() -> list[str]:
-    """Return `OUTPUTS` as lines of Markdown; outputs that do the same share a line, and reasons are notes below."""
+    """Return `OUTPUTS` as lines of Markdown; equal outputs share a line, and reasons are notes below."""
     alike: dict[Leaves, list[str]] = {}
     notes: list[str] = []
     for name, leaves in OUTPUTS.items():

@@ -45,7 +45,7 @@ def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
 
 
 def corners_of(low: ArrayLike, high: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Validate the corners (3,) of a box; raises StereovoxError if they are none."""
+    """Validate the corners (3,) of a box; raises StereovoxError if they are invalid."""
     corners = np.asarray(low, float), np.asarray(high, float)
     if corners[0].shape != (3,) or corners[1].shape != (3,) or not (corners[0] < corners[1]).all():
         raise StereovoxError(f"box from {low} to {high}: give two corners X, Y, Z, the second above the first on each")

@@ -63,7 +63,7 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
         pairs = before.states(cells_a) * len(State) + after.states(cells_b)
         counts += np.bincount(pairs.ravel(), minlength=len(counts))
         found.append([cells_where(coords, pairs, chosen)[0] for chosen in _kinds(pairs)])
-    counts[0] = 0  # of blocks that hold other cells
+    counts[0] = 0  # from blocks that also hold known cells
     kinds = [_ascending(np.concatenate(kind)) for kind in zip(*found, strict=True)]
     return Difference(*kinds, counts=counts.reshape(4, 4))
 

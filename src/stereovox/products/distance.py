@@ -21,19 +21,19 @@ from stereovox.products import _distance
 from stereovox.products.transform import Transform
 
 TRIGGER = 1 / 8
-"""A window follows the camera once that is farther from its centre than this share of the window."""
+"""A window follows the camera once the camera is farther from its centre than this share of its size."""
 TIE = 1e-6
 """A face of the box this near to a face of cells, in cells, counts as on it."""
 CORNER = "(3,) metres, x y z"
 MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
-"""How many cells nearer an obstacle counts along each axis."""
+"""Cells by which an obstacle counts as nearer along each axis."""
 
 
 class DistanceField:
     """Exact distances in metres from all cells of a box to the nearest obstacle in the box.
 
-    The box is `low` to `high`, widened to whole cells, or a window of `size` about the camera, which it follows by
-    whole blocks of 8 cells once the map knows a camera. Obstacles outside the box do not count: a cell nearer to the
+    The box is `low` to `high`, widened to whole cells, or a window of `size` around the camera, which it follows by
+    whole blocks of 8 cells once the map has a frame. Obstacles outside the box do not count: a cell nearer to the
     border of the box than to an obstacle may be nearer to one beyond it. After `update` the field equals one computed
     from scratch.
 
@@ -45,12 +45,12 @@ class DistanceField:
         low: Lowest corner (3,) of the box in metres, world frame.
         high: Highest corner (3,).
         size: Sides (3,) of a moving window in metres, in place of `low` and `high`.
-        max_distance: Metres; obstacles farther away count as none.
+        max_distance: Metres; obstacles farther away are ignored.
         to: States that count as obstacles (not FREE); with UNKNOWN, unseen space also keeps a robot away.
         measure: `centres`: from cell centre to cell centre, 0 in an obstacle, as
-            `scipy.ndimage.distance_transform_edt`. `faces`: from the centre to the nearest face of the obstacle's cell.
-            `gap`: from the nearest point of the cell: a ball about any point of the cell meets nothing if its radius is
-            smaller.
+            `scipy.ndimage.distance_transform_edt`. `faces`: from the cell's centre to the nearest face of the obstacle.
+            `gap`: from the nearest point of the cell: a ball around any point of the cell touches nothing if its radius
+            is smaller.
 
     Raises:
         StereovoxError: No box, too large a box, or other bad input.
@@ -89,13 +89,13 @@ class DistanceField:
         """Bring the field up to date with the map.
 
         Returns:
-            How many cells became obstacles or ceased to be.
+            Number of cells that became obstacles or ceased to be.
 
         Raises:
-            StereovoxError: A window has no camera to follow, since the map has no frame yet.
+            StereovoxError: A window has no camera to follow because the map has no frame yet.
         """
         with ExitStack() as mine:
-            with self._map.lock:  # always before this field's own, and only as long as the map is read
+            with self._map.lock:  # always taken before this field's own, only while the map is read
                 mine.enter_context(self._lock)
                 if self._follows:
                     self._follow()
@@ -106,7 +106,7 @@ class DistanceField:
 
     @property
     def origin(self) -> NDArray[np.float64]:
-        """Lowest corner (3,) of the box in metres, world frame: that of cell [0, 0, 0] of `metres`."""
+        """Lowest corner (3,) of the box in metres, world frame: the corner of cell [0, 0, 0] of `metres`."""
         return np.asarray(self._low * self._cell, float)
 
     @property
@@ -116,7 +116,7 @@ class DistanceField:
 
     @property
     def metres(self) -> NDArray[np.float32]:
-        """Distances of all cells (x, y, z) in metres, infinite where no obstacle is near enough.
+        """Distances of all cells (x, y, z) in metres, infinite if no obstacle is near enough.
 
         A read-only view that `update` changes.
         """
@@ -125,7 +125,7 @@ class DistanceField:
 
     @property
     def obstacles(self) -> NDArray[np.bool_]:
-        """Which cells (x, y, z) are obstacles; a read-only view."""
+        """Obstacle mask (x, y, z); a read-only view."""
         self._check_place()
         return self._transform.as_box(self._transform.field.mask).view(bool)
 
@@ -136,7 +136,7 @@ class DistanceField:
             points: (N, 3) metres, world frame.
 
         Returns:
-            (N,) float32 metres of the cells that hold the points: infinite where no obstacle is near enough, NaN
+            (N,) float32 metres of the cells that hold the points: infinite if no obstacle is near enough, NaN
                 outside the box and for points that are not finite.
         """
         with self._lock:
@@ -152,7 +152,7 @@ class DistanceField:
             points: (N, 3) metres, world frame.
 
         Returns:
-            (N, 3) float32 metres per metre along each axis, world frame; NaN where the point's own cell has no
+            (N, 3) float32 metres per metre along each axis, world frame; NaN if the point's own cell has no
                 distance.
         """
         with self._lock:
@@ -179,7 +179,7 @@ class DistanceField:
     def _slope(
         self, cells: NDArray[np.int64], inside: NDArray[np.bool_], here: NDArray[np.float32], axis: int
     ) -> NDArray[np.float32]:
-        """Return the difference quotient (N,) along one axis; 0 where no neighbour has a distance."""
+        """Return the difference quotient (N,) along one axis; 0 if no neighbour has a distance."""
         ends, offs = [], []
         for step in (-1, 1):
             beside = cells.copy()
@@ -192,7 +192,7 @@ class DistanceField:
         return rise / np.maximum(offs[0].astype(np.float32) + offs[1], 1)
 
     def _cells_of(self, points: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return cells (N, 3) of the box, and which points (N,) are inside it."""
+        """Return cells (N, 3) of the box, and a mask (N,) of the points inside it."""
         with np.errstate(invalid="ignore"):
             cells = np.floor(points_of(points) / self._cell) - self._low
             inside = np.all((cells >= 0) & (cells < self._shape), axis=1)  # False for NaN
@@ -217,14 +217,14 @@ class DistanceField:
         return first, np.ceil(corners[1] - TIE).astype(np.int64) - first
 
     def _about_zero(self, size: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the window as it stands until the camera is known, on faces of blocks."""
+        """Return the window before the camera is known, aligned to blocks."""
         wanted = points_of([] if size is None else size, "size", wanted="(3,) metres") / self._cell
         if wanted.shape != (1, 3) or not ((wanted > 0) & (wanted < INDEX_LIMIT)).all():
             raise StereovoxError(f"size {size}: give three lengths in metres")
         return np.zeros(3, np.int64), np.ceil(wanted[0] - TIE).astype(np.int64)
 
     def _follow(self) -> None:
-        """Move the window by whole blocks where the camera is too far from its centre: `_seen` is stored by blocks."""
+        """Move the window by whole blocks if the camera is too far off centre: `_seen` is stored by blocks."""
         self._check_place()
         assert self._map.viewpoint is not None
         camera = self._map.viewpoint.T_world_camera[:3, 3] / self._cell
@@ -236,7 +236,7 @@ class DistanceField:
 def write_distance(field: DistanceField, path: str | Path) -> None:
     """Write a field for `numpy.load`.
 
-    Arrays: `distance` (x, y, z) float32 metres, infinite where no obstacle is near enough; `origin` (3,) metres, lowest
+    Arrays: `distance` (x, y, z) float32 metres, infinite if no obstacle is near enough; `origin` (3,) metres, lowest
     corner of cell [0, 0, 0]; `cell` (3,) metres, its sides. The centre of cell (i, j, k) is at origin + (i + 0.5, ...)
     * cell. Raises StereovoxError for an ending other than .npz, MapFileError if the file cannot be written.
     """

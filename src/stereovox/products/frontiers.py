@@ -39,7 +39,7 @@ class Frontier:
     Attributes:
         cells: (N, 3) int32, ascending.
         centroid: (3,) metres, mean of the cell centres; not always free itself.
-        look_from: (3,) metres, centre of a reachable free cell that sees the cell nearest to the centroid; None if
+        look_from: (3,) metres, centre of a reachable free cell with a view of the cell nearest to the centroid; None if
             there is none.
     """
 
@@ -60,7 +60,7 @@ def frontiers(
 ) -> list[Frontier]:
     """Find the frontiers of a map.
 
-    A free cell belongs to a frontier where one of the six cells at its faces is unknown. Cells that share a corner form
+    A free cell belongs to a frontier if one of the six cells at its faces is unknown. Cells that share a corner form
     one frontier, which is halved across its longest direction until it is no longer than `longest` (Zhou et al. 2021,
     FUEL, IV-A).
 
@@ -69,18 +69,17 @@ def frontiers(
         smallest: Fewest cells of a frontier, before it is halved.
         longest: Largest extent in metres.
         heights: Lowest and highest metres above the floor for cell centres; None for all.
-        start: (3,) metres, where the robot is; None: the camera of the last frame. The robot reaches the free cells
-            that are connected, face by face, with the one nearest to it; with neither, it is in the largest connected
-            part.
-        radius: Metres about the robot's centre that must be free.
-        floor: Metres along the map's `up` of a level floor, from which `heights` are measured; None: as `scan.floor`
+        start: (3,) metres, position of the robot; None: the camera of the last frame. The robot reaches the free cells
+            connected, face by face, with the one nearest to it; without either, it is in the largest connected part.
+        radius: Metres around the robot's centre that must be free.
+        floor: Metres along the map's `up` of a level floor, the reference of `heights`; None: as `scan.floor`
             states, or else it is found at each place.
 
     Returns:
         The frontiers, largest first.
 
     Raises:
-        StereovoxError: Values that make no sense, or heights in a map that shows no floor.
+        StereovoxError: A value is invalid, or heights are given for a map that shows no floor.
     """
     from scipy.spatial import KDTree
 
@@ -104,7 +103,7 @@ def frontiers(
 def write_frontiers(found: Sequence[Frontier], path: str | Path) -> None:
     """Write frontiers for `numpy.load`.
 
-    Arrays: `cells` (N, 3) int32, `frontier` (N,) int32, the number of the frontier of each cell; `centroid` (K, 3) and
+    Arrays: `cells` (N, 3) int32, `frontier` (N,) int32, the index of each cell's frontier; `centroid` (K, 3) and
     `look_from` (K, 3) in metres, NaN if there is none. Raises MapFileError if the file cannot be written.
     """
     no_viewpoint = np.full(3, np.nan)

@@ -26,9 +26,9 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     """Merge two maps.
 
     Evidence adds up: log-odds a + b - prior, each counted from its own prior, then clamped (Thrun et al. 2005,
-    Probabilistic Robotics, 9.2). Where nothing was clamped before, the result is the map of all frames together, except
-    for one step of a stored number where a sum passed just through "unknown". A cell unknown to one map is the other's.
-    Times are the later ones, frames and refusals are summed, the viewpoint is the later one.
+    Probabilistic Robotics, 9.2). If nothing was clamped before, the result is the map of all frames together, except
+    for one step of a stored number if a sum hit "unknown" exactly. A cell unknown to one map is the other's.
+    Times and viewpoint are the later ones; frames and refusals are summed.
 
     Args:
         a: A map, whose settings the result has.
@@ -70,7 +70,7 @@ def _summed(a: VoxelMap, mine: NDArray[np.integer], b: VoxelMap, theirs: NDArray
 
 
 def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | None) -> NDArray[np.uint32]:
-    """Return the later time (n, 512) of each cell of blocks (n, 3), from `start_ns` on; NEVER if none is kept."""
+    """Return the later time (n, 512) of each cell of blocks (n, 3), counted from `start_ns`; NEVER if none is kept."""
     times = np.full((len(coords), CELLS), NEVER, np.int64)
     for one in (a, b):
         if one.config.map.keep_times and one.storage.times_start_ns is not None and start_ns is not None:

@@ -25,7 +25,7 @@ from stereovox.products.floor.floor_axes import nearest_axis, upright_axes
 PIECE = 512
 """Blocks processed together."""
 RIGID = 1e-3
-"""Largest entry of |R^T R - I| that still passes for rounding."""
+"""Largest entry of |R^T R - I| accepted as rounding."""
 NEAR = 1e-6
 """Rounding tolerance, in cells, for a point on a face."""
 TOUCHING = 2e-5
@@ -38,16 +38,15 @@ PARALLEL = 1e-6
 def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     """Return a map in frame b resampled in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
 
-    A cell gets the log-odds and the time of the cell that its centre lies in. Where the motion maps cells onto cells
-    (whole cells, quarter turns) that is exact. Where it does not, nothing occupied, tentative or unknown becomes free:
+    A cell gets the log-odds and the time of the cell that contains its centre. If the motion maps cells onto cells
+    (whole cells, quarter turns) that is exact. If it does not, nothing occupied, tentative or unknown becomes free:
 
-    - a cell also gets the log-odds of any occupied or tentative cell whose centre lies in it, if higher: so whatever is
-    occupied stays so, in at least one cell;
-    - one that would then be free, but overlaps an occupied or tentative cell, is tentative. The evidence for an
-    obstacle in the cells it overlaps counts by its share of the cell;
-    - one that would be free, but overlaps an unknown cell, is unknown.
+    - a cell also gets the log-odds of any occupied or tentative cell whose centre lies in it, if higher: so an occupied
+    cell stays occupied, in at least one cell; - a cell that would then be free, but overlaps an occupied or tentative
+    one, is tentative. The evidence for an obstacle in the cells it overlaps counts by its share of the cell; - a cell
+    that would be free, but overlaps an unknown one, is unknown.
 
-    Raises StereovoxError if T_a_b is no rigid motion, or leads too far away.
+    Raises StereovoxError if T_a_b is not rigid, or moves the map too far away.
     """
     T, config = rigid(T_a_b), voxel_map.config
     if config.up_direction is not None:
@@ -77,17 +76,17 @@ def _resampled(voxel_map: VoxelMap, T: Transform, config: Config) -> VoxelMap:
     path, loops = _moved_path(history.path, T), None if history.loops is None else history.loops.moved(T)
     there.history = replace(
         history, trusted={}, waiting={}, looks={}, doubts={}, path=path, loops=loops
-    )  # no pose of frame b is left
+    )  # poses of frame b no longer apply
     if voxel_map.viewpoint is not None:
         there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)
     return there
 
 
 def levelled(voxel_map: VoxelMap) -> VoxelMap:
-    """Return a map turned so that its z axis points up, where up lies between its axes; else the map itself.
+    """Return a map turned so that its z axis points up if up lies between its axes; else the map itself.
 
-    The turn is about a level axis, so directions on the floor stay as near to the map's as can be. Its settings then
-    say `up = "z"`. Raises StereovoxError as `moved`.
+    The turn is about a level axis, so directions on the floor stay as near to the map's as possible. Its settings get
+    `up = "z"`. Raises StereovoxError as `moved`.
     """
     if voxel_map.config.up_direction is None:
         return voxel_map
@@ -108,7 +107,7 @@ def level_transform(up_direction: ArrayLike) -> Transform:
 
 
 def rigid(T: ArrayLike) -> Transform:
-    """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError if it is none."""
+    """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError if it is not rigid."""
     T = np.asarray(T, float)
     error = rigidity_error(T)
     if not error <= RIGID:
@@ -125,13 +124,13 @@ def _moved_path(path: CameraPath, T: Transform) -> CameraPath:
 
 
 def higher(mine: NDArray[np.integer], cells: NDArray[np.integer], unknown: int) -> NDArray[np.integer]:
-    """Return the larger of two maps' cells as stored, where one is unknown the other."""
+    """Return the larger of two maps' cells as stored; if one is unknown, the other."""
     known = np.where(mine == unknown, cells, np.maximum(mine, cells))
     return np.where(cells == unknown, mine, known)
 
 
 def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-    """Change those of `cells` (n, 512) of blocks (n, 3) in frame a that are free but overlap what is not in frame b."""
+    """Change free ones of `cells` (n, 512) of blocks (n, 3) in frame a that overlap non-free ones in frame b."""
     rules, sides, R_b_a = CellRules(voxel_map.config.map), np.array(voxel_map.config.cell), inverse(T)[:3, :3]
     corners = transform_points(inverse(T), coords * (SIDE * sides)) / sides
     low = np.floor(corners).astype(np.int32)
@@ -144,7 +143,7 @@ def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: 
 def _separating_axes(
     R_b_a: NDArray[np.float64], sides: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the separating directions (n, 3) of cells of both frames, and the centre distance (n,) from which they
+    """Return the separating directions (n, 3) of cells of both frames, and the centre distance (n,) at which they
     separate.
 
     Both in cells of frame b, whose cells are 1 wide along each direction: the edges of both frames, and the normals of
@@ -158,7 +157,7 @@ def _separating_axes(
 
 
 def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
-    """Return a map of the occupied and tentative cells alone, each moved into the one cell that holds its middle."""
+    """Return a map of the occupied and tentative cells alone, each moved into the one cell that contains its centre."""
     rules, parts = CellRules(voxel_map.config.map), []
     for coords, cells in voxel_map.storage.slabs():
         solid = rules.states(cells) >= State.TENTATIVE
@@ -166,7 +165,7 @@ def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
         times = voxel_map.storage.times_of(coords)[solid] if voxel_map.config.map.keep_times else np.zeros(len(stored))
         parts.append((indices, stored, times))
     indices, stored, times = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.argsort(stored, kind="stable")  # of several in one cell the last counts, the highest
+    order = np.argsort(stored, kind="stable")  # of several in one cell the last, the highest, wins
     places = transform_points(T, voxel_map.centers(indices[order])) / voxel_map.config.cell
     indices = np.floor(places + NEAR).astype(np.int64)
     pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.storage.cell_format.log_odds(stored[order]))
@@ -176,13 +175,13 @@ def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
 
 
 def _reached(voxel_map: VoxelMap, T: Transform) -> NDArray[np.int32]:
-    """Return the blocks (n, 3) that the map's blocks may lie in after the motion, each once."""
+    """Return the blocks (n, 3) that the map's blocks may reach after the motion, each once."""
     block = SIDE * np.array(voxel_map.config.cell)
     coords = np.concatenate([coords for coords, _ in voxel_map.storage.slabs()])
     corners = np.array(list(product((0, 1), repeat=3)))
     places = transform_points(T, ((coords[:, None] + corners) * block).reshape(-1, 3)).reshape(-1, 8, 3) / block
     if np.abs(places).max(initial=0) * SIDE >= INDEX_LIMIT:
-        raise StereovoxError("the transform takes the map farther away than cells can be counted; give it in metres")
+        raise StereovoxError("the transform takes the map beyond the range of cell indices; give it in metres")
     low, high = np.floor(places.min(axis=1) - NEAR).astype(np.int64), np.floor(places.max(axis=1) + NEAR).astype(int)
     most = (high - low).max(axis=0, initial=-1) + 1
     found = [(low + offset)[(low + offset <= high).all(axis=1)] for offset in np.ndindex(*most)]
@@ -190,14 +189,14 @@ def _reached(voxel_map: VoxelMap, T: Transform) -> NDArray[np.int32]:
 
 
 def _cells_of(coords: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the indices (n * 512, 3) of all cells of blocks (n, 3), as they are stored."""
+    """Return the indices (n * 512, 3) of all cells of blocks (n, 3), in storage order."""
     return (
         coords[:, None].astype(np.int64) * SIDE + np.stack(np.unravel_index(np.arange(CELLS), (SIDE,) * 3), 1)
     ).reshape(-1, 3)
 
 
 def _stored_at(voxel_map: VoxelMap, points: NDArray[np.float64]) -> NDArray[np.integer]:
-    """Return what the cells at points (N, 3) store; no known cell has a log-odds of just zero."""
+    """Return the stored cells at points (N, 3); no known cell has a log-odds of exactly zero."""
     log_odds, cell_format = voxel_map.log_odds(points), voxel_map.storage.cell_format
     stored = np.where(log_odds == 0, cell_format.unknown, cell_format.stored(log_odds))
     return stored.astype(cell_format.dtype)

@@ -29,13 +29,13 @@ def with_margins(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.int32], NDArr
 
 
 def shifted(margins: NDArray, step: tuple[int, int, int]) -> NDArray:
-    """Return for each cell (n, 8, 8, 8) of blocks with margins the one that is a `step` of at most one cell away."""
+    """Return, for each cell (n, 8, 8, 8) of blocks with margins, the cell one `step` (at most one cell) away."""
     x, y, z = (slice(1 + d, 1 + d + SIDE) for d in step)
     return margins[:, x, y, z]
 
 
 def components(cells: NDArray[np.integer], steps: Iterable[tuple[int, int, int]]) -> NDArray[np.int32]:
-    """Return the number (N,) of the component of each of the distinct cells (N, 3), from 0 on.
+    """Return the component (N,), from 0, of each of the distinct cells (N, 3).
 
     Cells that are one of the `steps` apart, in either direction, belong to one component.
     """
@@ -55,20 +55,20 @@ def components(cells: NDArray[np.integer], steps: Iterable[tuple[int, int, int]]
 
 
 def _places(cells: NDArray[np.integer], longest: int) -> tuple[NDArray[np.int64], list[int]]:
-    """Return one number (N,) for each cell, and the sides of the box they count in.
+    """Return one number (N,) for each cell, and the sides of the box in which they count.
 
-    The box is so much wider that no step, at most `longest` on each axis, leads out of it and in again elsewhere.
+    The box is padded so that no step, at most `longest` on each axis, wraps around.
     """
     low = cells.min(axis=0).astype(np.int64)
     extent = [int(n) + 1 + longest for n in cells.max(axis=0) - low]
     if extent[0] * extent[1] * extent[2] > MAX_PLACES:
-        raise StereovoxError("the map reaches too far to find what is connected; take a part of it: stereovox crop")
+        raise StereovoxError("the map is too wide for a search of connected cells; take a part of it: stereovox crop")
     x, y, z = (cells - low).T
     return (x * extent[1] + y) * extent[2] + z, extent
 
 
 def _apart(ascending: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the positions of all pairs of numbers, in ascending order, that are `step` apart."""
+    """Return the positions of all pairs of ascending numbers that are `step` apart."""
     at = np.searchsorted(ascending, ascending + step).clip(max=len(ascending) - 1)
     found = np.flatnonzero(ascending[at] == ascending + step)
     return found, at[found]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether a ball can move along a path, where it would be stopped, and how old the evidence is."""
+"""Check whether a ball can move along a path, where it is blocked, and how old the evidence is."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ PIECE = 8
 
 
 class PathCheck(NamedTuple):
-    """What a map says about a path of N segments.
+    """The check of a path of N segments against a map.
 
     Attributes:
         worst: (N,) uint8, the worst `State` that the ball touches on each segment (`check_capsules`).
         blocked_at: Metres along the path until the ball touches a blocking cell; None if it reaches the end.
         oldest_s: (N,) float32 seconds since the last evidence of the stalest known cell that a segment touches; NaN
-            where it touches none. None if the map keeps no times.
+            if it touches none. None if the map keeps no times.
     """
 
     worst: NDArray[np.uint8]
@@ -58,10 +58,10 @@ def check_path(
         waypoints: (N + 1, 3) metres, world frame.
         radius: Radius of the ball in metres.
         through_unknown: Unknown cells do not block.
-        now_ns: Time from which ages count; None: that of the map's last frame.
+        now_ns: Time at which ages are taken; None: the map's last frame.
 
     Returns:
-        The verdict on each segment.
+        The result for each segment.
 
     Raises:
         StereovoxError: Fewer than two waypoints or other bad input.
@@ -90,7 +90,7 @@ def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
 def _free_share(
     voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, blocking: list[State]
 ) -> float:
-    """Return how much of a blocked segment, 0 to 1, the ball can travel."""
+    """Return the share of a blocked segment, 0 to 1, that the ball can travel."""
     if voxel_map.check_capsules(start, start, radius)[0] in blocking:
         return 0.0
     low, high = 0.0, 1.0
@@ -140,7 +140,7 @@ def _touched(
 
 
 def _within(box: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[float, float]:
-    """Return from where to where, 0 to 1, a segment is in a box (2, 3); the first is larger where it never is."""
+    """Return the interval, within 0 to 1, of a segment in a box (2, 3); the first is larger if it misses the box."""
     with np.errstate(divide="ignore", invalid="ignore"):
         crossings = np.sort((box - start) / (end - start), axis=0)
     level = start == end
@@ -151,7 +151,7 @@ def _within(box: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[n
 def _away(
     a: NDArray[np.float64], b: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how far boxes low..high (n, 3) are from a segment (n,): where the distance's slope changes its sign."""
+    """Return the distance (n,) of boxes low..high (n, 3) from a segment: at the zero of its derivative."""
     before, after = np.zeros((len(low), 1)), np.ones((len(low), 1))
     for _ in range(HALVINGS):
         middle = (before + after) / 2

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact Euclidean distance transform of a box of cells, kept up to date as cells become obstacles or cease to be.
 
-Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions: one axis after the other.
-By hand, because SciPy and OpenCV can only do the whole box anew (20 to 51 ms, not 2.5 to 6.6:
+Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions: axis by axis.
+Our own, because SciPy and OpenCV only redo the whole box (20 to 51 ms, not 2.5 to 6.6:
 `benchmarks/distance.py`).
 """
 
@@ -18,22 +18,22 @@ from stereovox.kernels.threads import in_shards
 from stereovox.products import _transform
 
 LANES = 32
-"""Rows are padded to a multiple of it: whole vectors."""
+"""Rows are padded to a multiple of this: whole vectors."""
 MAX_CELLS, MAX_SIDE = 2**28, 2**14
 """Longest side of a box, in cells."""
 UNLIMITED = np.float32(3e38)
 
 
 class Field(NamedTuple):
-    """The arrays of a transform as kernels take them. Axes by length: slabs a, rows b, and lanes c with their padding.
+    """The arrays of a transform as kernels take them. Axes by length: slabs a, rows b, and lanes c with padding.
 
     mask: (a, b, c) uint8, 1 for obstacles.
     runs: (a, b, c) int16 rows to the nearest obstacle of the same slab and lane.
-    partial: (b, a, c) float32 squares to the nearest of the same slab.
-    gone: what they were before where that was less, infinite elsewhere; only where `touched`.
-    squares: (b, a, c) float32 to the nearest of all. metres: the distances these stand for.
+    partial: (b, a, c) float32 squares to the nearest in the same slab.
+    gone: earlier values of `partial` that were smaller, else infinite; valid only where `touched`.
+    squares: (b, a, c) float32 to the nearest of all. metres: the same as distances.
     lowest, highest: (b, a) of `partial`, of `squares`.
-    touched: (b, a) least square that changed in `partial`, before or after; -1 where none did.
+    touched: (b, a) least square that changed in `partial`, before or after; -1 if none did.
     """
 
     mask: NDArray[np.uint8]
@@ -48,9 +48,9 @@ class Field(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """The square for each number of cells off, by axis, in units of `unit` metres; lanes: the same to both sides.
+    """The square by offset in cells, for each axis, in units of `unit` metres; lanes: for both directions.
 
-    none: the square that stands for no obstacle.
+    none: the square for no obstacle.
     """
 
     across: NDArray[np.float32]
@@ -61,11 +61,12 @@ class Costs(NamedTuple):
 
 
 class Transform:
-    """Distances in a box of `shape` (3,) cells with `sides` (3,) in metres; at first it has no obstacle.
+    """Distances in a box of `shape` (3,) cells with `sides` (3,) in metres; initially without obstacles.
 
-    max_distance: metres, to one part in a million; obstacles farther off count as none.
-    nearer: how many cells nearer they count along each axis: 0 from middle to middle of a cell, 0.5 from the middle to
-    the nearest face, 1 from the nearest of all points of a cell; more as if all obstacles were larger by the rest.
+    max_distance: metres, to one part in a million; obstacles farther away are ignored.
+    nearer: cells by which obstacles count as nearer along each axis: 0 from centre to centre of cells, 0.5 from the
+    centre to the nearest face, 1 from the nearest of all points of a cell; more as if all obstacles were larger by the
+    rest.
     order: the axes from the longest to the shortest. field: the arrays, whose axes are in that order.
     """
 
@@ -86,13 +87,13 @@ class Transform:
         def in_planes(part: slice) -> None:
             _transform.across_planes(self.field, self.costs, part.start, threads)
 
-        interleaved = [slice(n, None) for n in range(threads)]  # what changed lies close together
+        interleaved = [slice(n, None) for n in range(threads)]  # changes are close together
         in_shards(in_slabs, interleaved)
         in_shards(in_planes, interleaved)
 
     @property
     def metres(self) -> NDArray[np.float32]:
-        """Distances of all cells in metres, axes as the box has them, infinite if there is no obstacle; a view."""
+        """Distances of all cells in metres, with the box's axes, infinite if there is no obstacle; a view."""
         return self.as_box(self.field.metres.swapaxes(0, 1))
 
     def as_box(self, cells: NDArray) -> NDArray:
@@ -115,7 +116,7 @@ class Transform:
     def _empty(self, slabs: int, rows: int) -> Field:
         padded, none = self.costs.lanes.size // 2, self.costs.none
         mask, runs = np.zeros((slabs, rows, padded), np.uint8), np.full((slabs, rows, padded), _transform.FAR)
-        squares = np.zeros((rows, slabs, padded), np.float32)  # zero in the padding: nothing to look for there
+        squares = np.zeros((rows, slabs, padded), np.float32)  # zero in the padding: nothing to search there
         squares[:, :, : self.lanes] = none
         superseded, metres = np.empty_like(squares), np.full_like(squares, np.inf)
         lowest, touched = np.full((rows, slabs), none), np.full((rows, slabs), _transform.UNCHANGED)
@@ -139,5 +140,5 @@ def _check(shape: tuple[int, ...], max_distance: float) -> None:
     if not max_distance > 0:
         raise StereovoxError(f"max_distance {max_distance:g}: give a length of more than 0 m")
     if np.prod(np.array(shape, float)) > MAX_CELLS or max(shape) > MAX_SIDE:
-        told = " x ".join(map(str, shape))
-        raise StereovoxError(f"a box of {told} cells is too large for a distance field; choose a smaller one")
+        sizes = " x ".join(map(str, shape))
+        raise StereovoxError(f"a box of {sizes} cells is too large for a distance field; choose a smaller one")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses from the images themselves."""
+"""Visual and depth odometry: camera poses estimated from the images themselves."""

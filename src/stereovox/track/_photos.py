@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that puts a depth image into the cells of another camera's image."""
+"""Kernel that projects a depth image into the cells of another camera's image."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 
 @kernel
 def laid_into(depth_m, columns, rows, R, t, lens, cell_px, step, total, number):
-    """Sum the inverse depths that every `step`th pixel of a depth image has in another camera, by cells of its image.
+    """Sum, per cell of another camera's image, the inverse depths of every `step`th pixel of a depth image.
 
     depth_m: (H, W) REP 117. columns (W,), rows (H, 2): rays; depth times (columns, rows) is the point. R (3, 3), t
     (3,): into the other camera's frame. lens (4,): its fx, fy, cx, cy. cell_px: size of a cell in its pixels. Written,

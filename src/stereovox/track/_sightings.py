@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that sums what landmarks say of the pose of the camera that sees them."""
+"""Kernel that sums the constraints of landmarks on the pose of the camera that sees them."""
 
 from stereovox.kernels._jit import kernel
 
@@ -10,12 +10,12 @@ def equations(
 ):
     """Fill the normal equations of a small motion (rotation about the camera, then shift, in the map's axes).
 
-    What `sightings.Sightings.residuals` says of each landmark, weighted by the inverse of its covariance, by `alike`
-    and by Geman and McClure's function of `reach` squared deviations. All float64.
+    The residuals of `sightings.Sightings.residuals`, weighted by their inverse covariance, by `alike` and by Geman and
+    McClure's function of `reach` squared deviations. All float64.
 
     centre, ray (N, 3), inverse, variance (N,): the landmarks. measured (N, 3), deviation (N,): where they are found.
-    lens (4,): fx, fy, cx, cy. R (3, 3), t (3,): T_world_camera. pixel: standard deviation of a corner's place. Written:
-    work (6, 3, 6), information (6, 6), gradient (6,).
+    lens (4,): fx, fy, cx, cy. R (3, 3), t (3,): T_world_camera. pixel: standard deviation of a corner's position.
+    Written: work (6, 3, 6), information (6, 6), gradient (6,).
     """
     information[:], gradient[:] = 0.0, 0.0
     fx, fy, cx, cy = lens
@@ -37,7 +37,7 @@ def equations(
         by_place[0, 0], by_place[0, 2] = fx / z, -fx * x / z**2
         by_place[1, 1], by_place[1, 2] = fy / z, -fy * y / z**2
         by_place[2, 2] = -rho / z**2
-        spread = 0.0  # of the landmark's own distance, by what is measured
+        spread = 0.0  # of the landmark's own distance, in measurement variances
         for j in range(3):
             for k in range(3):
                 by_world[j, k] = by_place[j, 0] * R[k, 0] + by_place[j, 1] * R[k, 1] + by_place[j, 2] * R[k, 2]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of tracking: patches of a depth image, surfels in a hash table, and how far patches lie off surfels.
+"""Kernels of tracking: patches of a depth image, surfels in a hash table, and their point-to-plane residuals.
 
 A surfel (9,) float32 is the mean of the patches that fell into one cubic cell: 0 weight, 1-3 position less the cell's
-corner in metres, 4-6 normal (its length reports how alike the normals are), 7 mean variance of the patches along their
+corner in metres, 4-6 normal (its length says how well the normals agree), 7 mean variance of the patches along their
 normals, 8 number of patches.
 """
 
@@ -13,7 +13,7 @@ from stereovox.kernels._jit import cell, kernel
 EMPTY = np.int64(-1)
 FIELDS = 9
 AGREE = np.float32(0.7)
-"""Cosine of the angle within which normals are taken for those of one surface; also how alike a surfel's must be."""
+"""Cosine of the largest angle between normals of one surface; also the least length of a surfel's mean normal."""
 STEEPEST = np.float32(0.15)
 """Cosine of the steepest view of a surface that is used."""
 FULL = 0.6
@@ -41,7 +41,7 @@ def patches(depth_m, columns, rows, step, point):
             for v in range(by * step, (by + 1) * step):
                 for u in range(bx * step, (bx + 1) * step):
                     z = depth_m[v, u]
-                    if abs(z - middle) < SAME * middle:  # false for what is not a number
+                    if abs(z - middle) < SAME * middle:  # false for NaN
                         number += 1
                         inverse += np.float32(1) / z
                         across += columns[u]
@@ -57,7 +57,7 @@ def patches(depth_m, columns, rows, step, point):
 
 @kernel
 def normals(point, normal):
-    """Write unit normals (h, w, 3) of patches, towards the camera; 0 where neighbours do not tell or it is steep."""
+    """Write unit normals (h, w, 3) of patches, towards the camera; 0 if neighbours are missing or it is steep."""
     height, width = point.shape[0], point.shape[1]
     for y in range(height):
         for x in range(width):
@@ -86,7 +86,7 @@ def normals(point, normal):
 def put(keys, surfels, size, points, directions, sigma, R, t, most):
     """Add patches to the surfels of cells of `size` metres; return how many cells are new.
 
-    keys: (2^k,) int64, EMPTY where free. points, directions: (N, 3) float32, camera frame, all with a normal; sigma
+    keys: (2^k,) int64, EMPTY if free. points, directions: (N, 3) float32, camera frame, all with a normal; sigma
     (N,) metres. R (3, 3), t (3,): pose. most: weight at which a surfel becomes a running mean.
     """
     mask, new = np.int64(keys.size - 1), 0
@@ -141,7 +141,7 @@ def nearest(keys, surfels, size, points, directions, R, t, slots):
 def drop(keys, surfels, size, centre, radius):
     """Drop all surfels whose cells are `radius` metres or more from `centre` (3,) along an axis; return their number.
 
-    Everything is float64: it is not done often.
+    Everything is float64, because this is rarely called.
     """
     dropped = 0
     for i in range(keys.size):
@@ -159,8 +159,8 @@ def equations(
 
     Residuals are distances of patches from the planes of their surfels, `slots` (N,), -1: none (Chen and Medioni 1992),
     weighted by their variance and `slack` metres, and by Geman and McClure's function of `reach` deviations.
-    Each product of two normals takes one from the patch and one from the surfel, so that their noise, which is not the
-    same, holds nothing: the normals are each other's instruments.
+    Each product of two normals takes one from the patch and one from the surfel. Their noise is independent, so it adds
+    no information: each normal is the instrument of the other.
 
     information (6, 6), gradient (6,) float64. spread (10,): sums of weights, of weighted x, y, z and of xx, xy, xz, yy,
     yz, zz of the patches, seen from the camera. ratios (N,) float32: squared residuals by their variance, of the
@@ -247,7 +247,7 @@ def _is_near(key, size, centre, radius):
 
 @cell
 def _free(keys, surfels, slot):
-    """Empty a slot; surfels that would not be found any more move towards their places (backward shift)."""
+    """Empty a slot; surfels that would become unreachable shift back."""
     mask = np.int64(keys.size - 1)
     hole, look = slot, (slot + 1) & mask
     while keys[look] != EMPTY:
@@ -286,7 +286,7 @@ def _key(x, y, z):
 
 @cell
 def _part(key, shift):
-    """Return the index of a cell, along one axis, of which `_key` made 21 bits at `shift`."""
+    """Return the index of a cell along one axis, from the 21 bits that `_key` put at `shift`."""
     return ((key >> shift) & np.int64(0x1FFFFF)) - ((key >> (shift + 20) & np.int64(1)) << 21)
 
 

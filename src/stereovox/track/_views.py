@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that compare points with the grid of depths that another image saw."""
+"""Kernels that compare points with the depth grid of another image."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ NEAREST = 0.05
 
 @kernel
 def stood_free(points, sigma, R, t, slope, nearest, deviations, tolerance, free):
-    """Set `free` (N,) bool for the points that stand where a view saw free space.
+    """Set `free` (N,) bool for points inside the free space of a view.
 
     points (N, 3), sigma (N,): float32. R (3, 3), t (3,): into the view's camera. slope (2,), nearest (rows, columns):
-    of the view. Slack: `deviations` times sigma and `tolerance` times what the view saw.
+    of the view. Slack: `deviations` times sigma plus `tolerance` times the view's depth.
     """
     for i in range(points.shape[0]):
         row, column, z = _place(points, i, R, t, slope, nearest.shape)
@@ -26,7 +26,7 @@ def stood_free(points, sigma, R, t, slope, nearest, deviations, tolerance, free)
 
 @kernel
 def seen_through(points, sigma, R, t, slope, depth, deviations, tolerance, step, found):
-    """Count every `step`th point that a view looks through (found[0]) and that it sees as well (found[1]).
+    """Count, of every `step`th point, those the view looks through (found[0]) and those it confirms (found[1]).
 
     depth: (rows, columns) of the view, NaN if it has none; the rest as in `stood_free`.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images that depth cameras take along: where their pixels are, by the depth image."""
+"""Color images next to depth images: landmarks whose distances come from the depth image."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
 
 MAX_ARM_M = 10.0
-"""Farthest that a camera can be next to the depth camera."""
+"""Largest distance of a color camera from the depth camera."""
 CELL, STEP = 4.0, 2
-"""Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
+"""Width of the other image's cells in depth pixels, and stride of the depth pixels used along each axis."""
 FOLLOWED = 0.2
-"""Share of the landmarks that must be found in an image: corners of noise are not."""
+"""Least share of landmarks that must be found again: corners of noise are not."""
 LAG = 0.05
-"""Share of a camera's motion since the image before by which it may have moved between a picture and the depth."""
+"""Share of a camera's motion since the previous image by which it may move between color and depth."""
 MOVED_M, MOVED_RAD = 0.005, np.radians(0.3)
-"""Motion from one image to the next that a picture must have seen for its agreement with the depth to count."""
+"""Least motion between color images for their agreement with depth to count."""
 CREDIT, MOST_CREDIT = 5, 20
-"""Agreements without which pictures do not contradict depth, and how many are remembered."""
+"""Agreements needed before color images may contradict depth, and how many are remembered."""
 MOST = 0.6
-"""Share of them that must lie where they should for a pose that they agree on."""
+"""Least share of inlier landmarks for a pose that they agree on."""
 SMOOTH = 0.02
-"""Share by which mean inverse depths around a corner, near and in its window, may differ if noise does not more.
+"""Largest relative difference, beyond noise, of mean inverse depths near a corner and in its window.
 
-On a plane they do not; on an edge, a corner is no fixed place.
+On a plane they agree; a corner on a depth edge is no fixed point.
 """
 
 
 class Sighted(NamedTuple):
-    """An image next to a depth image; camera, T_sensor_camera: as those of `Photo`."""
+    """An image next to a depth image; camera, T_sensor_camera: as in `Photo`."""
 
     sight: Sight
     camera: PinholeCamera
@@ -54,9 +54,9 @@ class Sighted(NamedTuple):
 
 
 class PhotoLandmarks(NamedTuple):
-    """Landmarks that were found in an image next to a depth image, and what they say of the depth camera's pose.
+    """Landmarks found in a color image, and their constraints on the depth camera's pose.
 
-    lag: (6, 6) covariance of how the camera may have moved between both images, as that of `Fit`.
+    lag: (6, 6) covariance of the camera's motion between both images, as in `Fit`.
     """
 
     found: Sightings
@@ -64,13 +64,13 @@ class PhotoLandmarks(NamedTuple):
     lag: NDArray[np.float64]
 
     def equations(self, reach: float = REACHES[-1]) -> Equations:
-        """Return the equations of the depth camera's pose; reach: as that of `Sightings.equations`."""
+        """Return the equations of the depth camera's pose; reach: as in `Sightings.equations`."""
         return of_sensor(self.found.equations(reach), self.T_sensor_camera)
 
     def fit(self, expected: Transform, doubt: NDArray[np.float64]) -> Fit | None:
         """Return the pose of the depth camera that most landmarks agree on; None if they agree on none.
 
-        expected, doubt: as those of `solve_stages`.
+        expected, doubt: as in `solve_stages`.
         """
         agreed = self.found.agreed(expected @ self.T_sensor_camera)
         if agreed is None:
@@ -81,16 +81,16 @@ class PhotoLandmarks(NamedTuple):
         return found if found.inlier_share > MOST else None
 
     def inlier_share(self, T: Transform) -> float:
-        """Return the share of the landmarks that are where they should be, seen by a depth camera at T."""
+        """Return the share of inliers among the landmarks for a depth camera at T."""
         return self.found.inlier_share(T @ self.T_sensor_camera)
 
 
 class Photos:
-    """Landmarks in the images that a depth camera takes along; images that cannot be used are left out.
+    """Landmarks in the color images of a depth camera; unusable images are left out.
 
     Attributes:
         offered: Number of images so far.
-        left_out: Number of those that could not be used.
+        left_out: Number of unusable images.
         why: What was wrong with the first of them.
     """
 
@@ -101,33 +101,33 @@ class Photos:
         self._followed: PhotoLandmarks | None = None
 
     def forget(self) -> None:
-        """Forget all that was learned."""
+        """Forget everything learned."""
         self._landmarks = self._followed = None
         self._credit = 0
 
     def count(self, why: str | None) -> None:
-        """Take note of an image; why it cannot be used: as that of `sighted_or_why`."""
+        """Count an image; `why` as in `sighted_or_why`."""
         self.offered += why is not None
         self.left_out += bool(why)
         self.why = self.why or why or ""
 
     def picture_use(self) -> str:
-        """Return how many images are used, or how many could not be and why, in words; "" if there is none."""
+        """Return how many images are used, or how many are not and why, in words; "" if there are none."""
         if self.left_out:
             count = f"{self.left_out} of {self.offered} pictures next to depth images are not used"
             return f"{count}; the first: {self.why}"
         return f"{self.offered} pictures next to depth images are used" if self.offered else ""
 
     def agree(self, T: Transform) -> None:
-        """Take note that landmarks and depth say the same of T_map_sensor, which counts where the camera has moved."""
+        """Record that landmarks and depth agree on T_map_sensor, which counts if the camera has moved."""
         motion = motion_between(self._last, T)
         if np.linalg.norm(motion[:3]) > MOVED_RAD or np.linalg.norm(motion[3:]) > MOVED_M:
             self._credit = min(self._credit + 1, MOST_CREDIT)
 
     def trusted(self) -> bool:
-        """Return whether landmarks may contradict depth, which costs them some trust: they agreed with it before.
+        """Return whether landmarks may contradict depth, because they agreed with it before; this costs trust.
 
-        A projected pattern, which moves with the camera, never did.
+        A projected pattern moves with the camera and never agrees.
         """
         self._credit -= 1
         trusted = self._credit >= CREDIT
@@ -135,7 +135,7 @@ class Photos:
         return trusted
 
     def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> PhotoLandmarks | None:
-        """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;
+        """Return the landmarks found in an image near T_map_sensor, less those in the free space of views;
         None if they are too few.
         """
         self._followed = None
@@ -154,7 +154,7 @@ class Photos:
         return self._followed
 
     def advance(self, seen: Sighted | None, T: Transform) -> None:
-        """Go on from an image whose depth camera is at T_map_sensor."""
+        """Advance to an image whose depth camera is at T_map_sensor."""
         self._last = T
         if seen is None:
             return
@@ -165,13 +165,13 @@ class Photos:
         self._followed = None
 
     def learn(self, seen: Sighted | None, T: Transform) -> None:
-        """As `advance`, and keep the view where it is new."""
+        """As `advance`, and keep the view if it is new."""
         self.advance(seen, T)
         if seen is not None and self._landmarks is not None:
             self._landmarks.keep(seen.sight, T @ seen.T_sensor_camera)
 
     def seek(self, seen: Sighted | None) -> list[tuple[Transform, PhotoLandmarks]]:
-        """Return where views were taken that look like an image, and the landmarks that both have in common."""
+        """Return the poses of views similar to an image, and the landmarks that both share."""
         self._followed = None
         if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
             return []
@@ -185,9 +185,9 @@ class Photos:
 def sighted_or_why(
     photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
 ) -> tuple[Sighted | None, str | None]:
-    """Return what of an image is used, and why it cannot be: "" if it can, None if there is no image.
+    """Return the used parts of an image, and why it is unusable: "" if it is usable, None if there is no image.
 
-    sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
+    sigma_of: standard deviation of a depth, indexed by depth times `rows_per_metre`.
     """
     try:
         return (None, None) if photo is None else (sighted(photo, image, sigma_of, rows_per_metre), "")
@@ -196,9 +196,9 @@ def sighted_or_why(
 
 
 def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Sighted:
-    """Return an image with the depths that the depth image next to it measured; the rest as `sighted_or_why`.
+    """Return an image with the depths of the depth image next to it; the rest as in `sighted_or_why`.
 
-    Raises FrameRefused if the image cannot be read, or is not what its camera says.
+    Raises FrameRefused if the image cannot be read, or does not match its camera.
     """
     camera, T_sensor_camera = _camera_of(photo)
     pixels = photo.pixels() if callable(photo.pixels) else photo.pixels
@@ -231,7 +231,7 @@ def of_sensor(equations: Equations, T_sensor_camera: Transform) -> Equations:
     def carried(T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         information, gradient = equations(T @ T_sensor_camera)
         x, y, z = T[:3, :3] @ T_sensor_camera[:3, 3]
-        by_sensor = np.eye(6)  # the camera shifts by the sensor's turn times its arm
+        by_sensor = np.eye(6)  # the sensor's turn shifts the camera by turn times arm
         by_sensor[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
         return by_sensor.T @ information @ by_sensor, by_sensor.T @ gradient
 
@@ -247,7 +247,7 @@ def inverse_depths(
 ) -> tuple[int, NDArray[np.float32]]:
     """Return the width of cells in pixels of another camera's image, and their inverse depths there in 1/m.
 
-    sigma_of: as that of `Photos.see`.
+    sigma_of: as in `sighted_or_why`.
 
     (h, w) float32, the mean of each cell and those around it; 0 if there is none, and next to edges.
     """
@@ -268,7 +268,7 @@ def inverse_depths(
 
 
 def _mean(total: NDArray[np.float32], number: NDArray[np.float32], cells: int) -> NDArray[np.float32]:
-    """Return the mean inverse depth of so many cells across around each."""
+    """Return the mean inverse depth in a window of `cells` cells around each."""
     sums = [
         np.asarray(cv2.boxFilter(part, -1, (cells, cells), normalize=False), np.float32) for part in (total, number)
     ]
@@ -285,7 +285,7 @@ def _distances(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Measure corners by the depths of the four cells around them; see `landmarks.Distances`.
 
-    sigma: of the inverse of a depth, by depth times `rows_per_metre`.
+    sigma: of an inverse depth, indexed by depth times `rows_per_metre`.
     """
     place = (pixels + 0.5) / cell_px - 0.5
     first = np.floor(place).astype(int)

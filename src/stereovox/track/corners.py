@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corners in grey images: where the strongest are, how they look, and where they are in the next image."""
+"""Corners in grey images: detection, description, and optical flow to the next image."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 QUIET, NOISE = 10, 5.0
-"""Percent of an image that shows no corners but noise, and how much stronger than that corners are."""
+"""Percentile of corner strength taken as noise, and how many times stronger corners must be."""
 ROUNDING = 1e-6
-"""Strength of the noise of an image in whole grey levels."""
+"""Corner strength of rounding to whole grey levels."""
 WINDOW, LEVELS = (15, 15), 3
-"""Pixels around a corner that are followed, in images halved so many times."""
+"""Window in pixels around a followed corner, and number of times the images are halved."""
 BACK_PX = 0.25
-"""Pixels by which a corner may miss where it came from when it is followed back."""
+"""Largest error in pixels of a corner that is tracked forward and back."""
 ALIKE_BITS = 50
-"""Bits by which ORB descriptors of one corner may differ."""
+"""Largest Hamming distance between ORB descriptors of one corner."""
 
 
 class Kind(NamedTuple):
     """Which corners are followed.
 
-    block: pixels across of the square by which their strength is reported. quality: their least strength by that of the
-    strongest (Shi and Tomasi 1994). fewer: share of them that may be lost before new ones are looked for.
+    block: pixels across of the square by which their strength is reported. quality: their least strength as a share of
+    the strongest (Shi and Tomasi 1994). fewer: share that may be lost before new ones are detected.
     """
 
     block: int
@@ -34,15 +34,15 @@ class Kind(NamedTuple):
 
 
 SHARP, SOFT = Kind(3, 0.01, 0.0), Kind(7, 0.003, 0.15)
-"""Corners of a street, which turns are told by best, and those that walls with little on them have."""
+"""Sharp corners, as in a street, which constrain turns best; and soft ones, as on nearly bare walls."""
 
 
 def strongest(
     image: NDArray[np.uint8], number: int, apart_px: float, mask: NDArray[np.uint8], kind: Kind
 ) -> NDArray[np.float32]:
-    """Return the strongest corners (N, 2) of an image where a mask is not 0, column and row to a part of a pixel.
+    """Return the strongest corners (N, 2) of an image where a mask is not 0, column and row with sub-pixel accuracy.
 
-    None in an image that is narrower than what is followed around a corner.
+    An image narrower than the tracking window has none.
     """
     if min(image.shape) < max(WINDOW):
         return np.empty((0, 2), np.float32)
@@ -58,7 +58,7 @@ def strongest(
 def flow(
     before: NDArray[np.uint8], after: NDArray[np.uint8], pixels: NDArray[np.float32], guess: NDArray[np.floating]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return where corners (N, 2) are in another image, and which are found there and back (Lucas and Kanade 1981)."""
+    """Return the corners (N, 2) in another image, and which pass the forward-backward check (Lucas and Kanade 1981)."""
     if not len(pixels):
         return pixels, np.zeros(0, bool)
     settings: dict[str, Any] = {
@@ -87,7 +87,7 @@ def described(image: NDArray[np.uint8], pixels: NDArray[np.float32]) -> tuple[ND
 
 
 def in_common(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return which corners of two sets of descriptors are each other's likest: their numbers here and there."""
+    """Return the mutual nearest neighbours of two sets of descriptors: their indices in both."""
     if not len(one) or not len(other):
         return np.empty(0, np.intp), np.empty(0, np.intp)
     pairs = cv2.BFMatcher.create(cv2.NORM_HAMMING, crossCheck=True).match(one, other)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose that several kinds of evidence ask for, near one that is expected."""
+"""Robust least squares for a pose near the expected one, from several kinds of evidence."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ STEPS = 6
 CONTRARY = 100.0
 """Squared deviations, of six, beyond which two poses contradict each other, such as those of two stages."""
 HOLDS = 1.0
-"""Information, by that of what is expected, below which a direction is not held."""
+"""Information, relative to that of the expectation, below which a direction is unconstrained."""
 RIGID = 0.01
-"""Largest rigidity error of a pose, motion or place of a camera that is given."""
+"""Largest rigidity error of a given pose, motion or mount."""
 
 LOST = "tracking_lost"
 """Reason of refusal of frames whose pose is not known."""
@@ -36,11 +36,11 @@ class Stage(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """How an image fits what was seen before.
+    """How an image fits the earlier ones.
 
     T_map_camera: the pose (4, 4). covariance: (6, 6), rotation about the camera (radians), then shift (metres), along
-    the map's axes. known: share of the image's parts that were seen before. usual: share of those that fit. fine: share
-    of what is known roughly that is known closely too; a warped image fits in the large and not in the small.
+    the map's axes. known: share of the image's parts that were seen before. inlier_share: share of those that fit.
+    fine: share of the roughly known parts that are closely known too; a warped image fits at large scale only.
     """
 
     T_map_camera: Transform
@@ -53,8 +53,8 @@ class Fit(NamedTuple):
 class Limits(NamedTuple):
     """How a kind of evidence is used.
 
-    spread: (6,) radians and metres by which a camera may leave its even motion from one image to the next. unsure: the
-    standard deviations, radians and metres, beyond which a pose is not believed; adrift: up to which it is followed.
+    spread: (6,) radians and metres by which a camera may leave constant velocity from one image to the next. unsure:
+    the standard deviations, radians and metres, above which a pose is not accepted; adrift: above which it is lost.
     """
 
     spread: NDArray[np.float64]
@@ -73,10 +73,10 @@ def both(one: Equations, other: Equations) -> Equations:
 
 
 def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
-    """Return equations without the directions that they do not hold, to be added to others.
+    """Return equations without their unconstrained directions, to be added to others.
 
-    There information that is less what noise feigns may be below 0: alone it holds nothing, and it must not take away
-    what other evidence holds. doubt: as that of `solve_stages`.
+    In such a direction, information minus the share that noise creates may be negative. It must not cancel the
+    constraints of other evidence. doubt: as in `solve_stages`.
     """
     scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
 
@@ -92,14 +92,14 @@ def holding(equations: Equations, doubt: NDArray[np.float64]) -> Equations:
 def solve_stages(
     stages: Iterable[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
 ) -> tuple[Transform, NDArray[np.float64]]:
-    """Return the pose (4, 4) that the stages lead to, and its covariance (6, 6) by the last one.
+    """Return the pose (4, 4) that the stages converge to, and its covariance (6, 6) by the last one.
 
-    Directions that nothing holds stay as expected. The covariance is the widest of those that the last stage saw on its
-    way. Where that stage contradicts the one before it, the pose is that of the one before, and open: its covariance is
-    `doubt`.
+    Unconstrained directions stay as expected. The covariance is the widest that the last stage saw while converging.
+    If the last stage contradicts the one before it, the earlier pose is returned, and its covariance is `doubt`: the
+    pose is open.
 
-    stages: each is asked for once those before it have settled. doubt: (6, 6) covariance of the expectation. start:
-    where to begin if not there.
+    stages: each is requested once the earlier ones have converged. doubt: (6, 6) covariance of the expectation. start:
+    the initial pose, if not `expected`.
     """
     scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
     T, covariance = expected if start is None else start, doubt
@@ -125,13 +125,13 @@ def solve_stages(
 
 
 def contrary(one: Transform, other: Transform, covariance: NDArray[np.float64]) -> bool:
-    """Return whether two poses are farther apart than errors of this covariance (6, 6) can be."""
+    """Return whether two poses are farther apart than errors of this covariance (6, 6) can explain."""
     moved = motion_between(one, other)
     return bool(moved @ np.linalg.solve(covariance, moved) > CONTRARY)
 
 
 def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the standard deviations of a pose along the directions that are held least: radians and metres."""
+    """Return the standard deviations of a pose along its least constrained directions: radians and metres."""
     turn, shift = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (covariance[:3, :3], covariance[3:, 3:]))
     return turn, shift
 
@@ -144,9 +144,9 @@ def motion_between(one: Transform, other: Transform) -> NDArray[np.float64]:
 def _held(
     information: NDArray[np.float64], scale: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what holds each direction of motion (6,), 0: nothing, and the directions (6, 6), columns.
+    """Return the information along each direction of motion (6,), 0 if none, and the directions (6, 6), columns.
 
-    scale: (6, 6), times its transpose the covariance of what is expected; a direction is one deviation long.
+    scale: (6, 6), a square root of the covariance of the expectation; each direction is one deviation long.
     """
     held, directions = np.linalg.eigh(scale.T @ information @ scale)
     return np.where(held > HOLDS, held, 0.0), scale @ directions

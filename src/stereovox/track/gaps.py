@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tracking was lost: spans of frames without a pose."""
+"""Tracking gaps: spans of frames without a pose."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from stereovox.frame import AnyFrame, UpdateReport
 
 @dataclass(frozen=True)
 class TrackingGap:
-    """Frames in a row whose pose is not known.
+    """Consecutive frames without a pose.
 
     Attributes:
-        first: Number of the first one, counted from 0.
-        last: Number of the last one.
-        begin_ns: Time of the first one in nanoseconds.
-        end_ns: Time of the last one.
-        why: Why the first one was lost, in words.
+        first: Index of the first frame, from 0.
+        last: Index of the last frame.
+        begin_ns: Time of the first frame in nanoseconds.
+        end_ns: Time of the last frame.
+        why: Why the first frame was lost, in words.
     """
 
     first: int
@@ -43,10 +43,10 @@ class TrackingGap:
 
 
 class LostSpans:
-    """Collects the spans of a run, frame by frame; it can be an observer of a mapping run.
+    """Collects the tracking gaps of a run, frame by frame; can observe a mapping run.
 
     Args:
-        number: Number of the first frame.
+        number: Index of the first frame.
 
     Attributes:
         spans: The spans so far.
@@ -63,7 +63,7 @@ class LostSpans:
         return sum(map(len, self.spans))
 
     def add(self, stamp_ns: int, why: str) -> None:
-        """Take note of the next frame; `why` is empty if it was tracked."""
+        """Record the next frame; `why` is empty if it was tracked."""
         number = self._number + self.frames
         self.frames += 1
         if not why:
@@ -74,5 +74,5 @@ class LostSpans:
             self.spans.append(TrackingGap(number, number, stamp_ns, stamp_ns, why))
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Take note of a frame that was offered to the map; one with a fault was not tracked."""
+        """Record a frame that was offered to the map; a frame with a fault was not tracked."""
         self.add(frame.stamp_ns, report.detail if frame.fault else "")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that frames bring, corrected by what the images show."""
+"""The frames' own poses, corrected by tracking."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ NO_START = "no frame so far has a pose of its own, at which the map could begin"
 
 
 class GuidedTracker:
-    """A tracker that goes from frame to frame as their own poses do, and corrects these by what is in view.
+    """A tracker that predicts motion from the frames' own poses and corrects it by registration to known surfaces.
 
-    Its world is that of the frames' own poses, which it leaves as they drift. A frame without a pose of its own is
-    tracked by its image alone.
+    Its world starts as the world of the frames' own poses and departs from it as they drift. A frame without a pose
+    is tracked by its image alone.
 
     Args:
         config: Settings by which depth is prepared, as for the map.
@@ -33,21 +33,21 @@ class GuidedTracker:
         self.prior_only_frames = 0
         self._config, self._tracker = config, Tracker(config)
         self._T_world_tracker: Transform | None = None
-        self._own: Transform | None = None  # pose of its own of the frame that the tracker stands at
+        self._own: Transform | None = None  # own pose of the last frame the tracker used
         self._at = np.full((4, 4), np.nan)
 
     def add(self, frame: AnyFrame) -> Tracked:
         """Return the pose of a frame, as `Tracker.add`.
 
         Args:
-            frame: Depth image or stereo pair, with a pose of its own or one that is not rigid, for none.
+            frame: Depth image or stereo pair, with its own pose; a pose that is not rigid counts as missing.
         """
         own = _own_pose(frame)
         if own is None and self._T_world_tracker is None:
             return Tracked(self._at, np.full((6, 6), np.inf), NO_START)
         known = own is not None and self._own is not None
         tracked = self._tracker.add(frame, inverse(self._own) @ own if known else None)  # pyright: ignore
-        if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image could not be used
+        if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image was unusable
             self._at, self._own = tracked.T_world_sensor, own
             if own is None and self._T_world_tracker is not None and not tracked.lost:
                 self._own = self._T_world_tracker @ tracked.T_world_sensor
@@ -59,15 +59,15 @@ class GuidedTracker:
         return tracked.moved(self._T_world_tracker)
 
     def expect(self, frame: AnyFrame) -> None:
-        """Begin with what can be done of the next frame, as `Tracker.expect`."""
+        """Start to prepare the next frame, as `Tracker.expect`."""
         self._tracker.expect(frame)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
+        """Return how the color images were used so far, in words; "" if there are none."""
         return self._tracker.picture_use()
 
     def _begin(self, own: Transform | None) -> None:
-        """Take the pose of the image that the tracker's map was begun with for where its world lies."""
+        """Place the tracker's world by the own pose of the image that its map began with."""
         self._own = own
         self._T_world_tracker = None if own is None else own @ inverse(self._at)
         if own is None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a camera turns by its gyroscope, and which way is up by its accelerometer.
+"""Camera rotation from a gyroscope, and the up direction from an accelerometer.
 
-Angular rates are integrated between images with the derivative by their bias, as Forster et al. 2017 do
-("On-Manifold Preintegration"); positions are not: an error of 0.1 m/s^2 of gravity is 0.2 m after 2 s.
+Angular rates are integrated between images with the derivative with respect to their bias, as Forster et al. 2017 do
+("On-Manifold Preintegration"); positions are not, because an error of 0.1 m/s^2 of gravity is 0.2 m after 2 s.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from stereovox.sources.imu import Imu, ImuReadings, up_of_force
 DENSITY = 5e-4
 """Noise of the angular rate in rad/s per root hertz: three times that of a small gyroscope."""
 SHARE = 0.02
-"""Share of a turn that it may be off by: scale, axes that are not square, mount."""
+"""Relative error of a turn: scale, axes that are not orthogonal, mount."""
 CLOCK_S = 0.003
 """Seconds between the clock of the IMU and the middle of the exposure."""
 BENDS = 0.25
-"""Share of the change from one reading to the next by which the rate may lie next to the straight line between."""
+"""Largest deviation of the rate from linear interpolation, as a share of the change between two readings."""
 BIAS, SETTLED, WANDERS, NO_BIAS = 0.02, 0.002, 1e-3, 0.1
-"""Bias of the angular rate in rad/s: its standard deviation at first and at least, how much it wanders in a second, and
-what is none any longer, but a wrong clock or unit."""
+"""Bias of the angular rate in rad/s: initial and least standard deviation, its random walk in a second, and the value
+above which it is no bias but a wrong clock or unit."""
 HOLDS_S, BRIDGES_S = 0.02, 0.5
-"""How long the first and the last reading hold, and the longest time between two that is bridged."""
+"""How long the first and last readings are valid, and the longest gap that is bridged."""
 WINDOW_S, TURNED, WINDOWS = 2.0, 0.05, 3
-"""Turns by images and gyroscope are compared after so many seconds or radians; so many turns say whether they agree."""
+"""Turns of images and gyroscope are compared after this many seconds or radians; agreement needs this many turns."""
 AGREES, DIFFERS, FADES = 0.25, 0.5, 0.9
-"""Share of the turns by which both differ: below it the gyroscope is believed, above it left out; memory of windows."""
+"""Relative difference below which the gyroscope is trusted and above which it is left out; decay of older windows."""
 WORST = 100.0
-"""Largest squared error, by what was expected, that one window counts for."""
+"""Cap on one window's squared error, relative to the expected one."""
 AROUND_S, AT_REST_S, LEAST_S = 3.0, 0.5, 2.0
-"""Readings around an image that say what is up: within so many seconds; how long a rest is; fewest while moving."""
+"""Seconds around an image whose readings give up; length of a rest; least length while moving."""
 REST_FORCE, REST_RATE, FEWEST = 0.15, 0.05, 5
-"""Standard deviation in m/s^2 and mean rate in rad/s up to which a camera is at rest, and readings that say so."""
+"""Standard deviation in m/s^2 and mean rate in rad/s up to which a camera is at rest, and fewest readings."""
 RESTING, MOVING = np.radians(1), np.radians(5)
-"""How far off up may be by an accelerometer at rest, and on the average of a moving one."""
+"""Largest error of up from an accelerometer at rest, and from the average of a moving one."""
 HALVES = np.radians(5)
-"""Largest angle between what is up by the first half of the readings and by the second."""
+"""Largest angle between up from the first half of the readings and from the second."""
 
 
 class Turn(NamedTuple):
-    """How a camera turned between two times.
+    """Rotation of a camera between two times.
 
-    R: (3, 3) R_before_now. by_bias: (3, 3), the derivative of its rotation vector, along the axes of the camera now, by
-    the bias along the camera's axes. seconds: how long it took. noise: variance in square radians about each axis of
-    what averages out; drift: standard deviation in radians of what does not, besides the bias.
+    R: (3, 3) R_before_now. by_bias: (3, 3), the derivative of its rotation vector, along the axes of the camera now,
+    with respect to the bias along the camera's axes. seconds: duration. noise: variance in square radians about each
+    axis of errors that average out; drift: standard deviation in radians of those that do not, except the bias.
     """
 
     R: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Turn(NamedTuple):
     drift: float
 
     def then(self, other: Turn) -> Turn:
-        """Return this turn and then another."""
+        """Return this turn followed by another."""
         return Turn(
             self.R @ other.R,
             other.R.T @ self.by_bias + other.by_bias,
@@ -75,9 +75,9 @@ STILL = Turn(np.eye(3), np.zeros((3, 3)), 0.0, 0.0, 0.0)
 
 
 def integrate(imu: Imu, begin_ns: int, end_ns: int, bias: NDArray[np.float64]) -> Turn | None:
-    """Return how a camera turned by the gyroscope; None if its readings do not cover the time.
+    """Return the camera's rotation by the gyroscope; None if its readings do not cover the time.
 
-    bias: (3,) rad/s along the camera's axes, which is taken off.
+    bias: (3,) rad/s along the camera's axes, subtracted from the readings.
     """
     readings = imu.between(begin_ns, end_ns)
     stamps = readings.stamps_ns
@@ -104,40 +104,40 @@ def _covers(stamps: NDArray[np.int64], begin_ns: int, end_ns: int) -> bool:
 
 
 def _rates(readings: ImuReadings, begin_ns: int, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angular rates (M, 3) along the camera's axes at times after the begin."""
+    """Return angular rates (M, 3) along the camera's axes at times after the beginning."""
     at = (readings.stamps_ns - begin_ns) / 1e9
     found = np.column_stack([np.interp(seconds, at, column) for column in readings.angular_rate.T])
     return found @ readings.T_sensor_imu[:3, :3].T
 
 
 class Gyroscope:
-    """Turns of a camera by its gyroscope, whose bias, doubt and trust follow from those that images show.
+    """Turns of a camera by its gyroscope; bias, uncertainty and trust are estimated from the images' turns.
 
     Args:
         imu: Its readings.
 
     Attributes:
-        left_out: Why it is not used any longer, in words: its turns are not those of the images; "" while it is.
-        used: Number of images whose turn was expected by it.
+        left_out: Why it is no longer used, in words (its turns contradict the images); "" while it is used.
+        used: Number of images whose turn it predicted.
     """
 
     def __init__(self, imu: Imu):
         self.left_out, self.used = "", 0
         self._imu = imu
         self._bias, self._unsure = np.zeros(3), np.eye(3) * BIAS**2
-        self._excess = 1.0  # squared errors by what was expected
+        self._excess = 1.0  # squared errors relative to the expected ones
         self._off, self._turned, self._windows = 0.0, 0.0, 0
         self._window: tuple[NDArray[np.float64], NDArray[np.float64], Turn] | None = None
         self._latest: tuple[int, int, Turn] | None = None
 
     @property
     def trusted(self) -> bool:
-        """Whether its turns are those of the images so far."""
+        """Whether its turns agreed with the images so far."""
         return not self.left_out and self._windows >= WINDOWS and self._off < AGREES * self._turned
 
     @property
     def use(self) -> str:
-        """What was made of it so far, in words."""
+        """How it was used so far, in words."""
         if self.left_out:
             return f"left out: {self.left_out}; correct its clock and mount, or add imu=off"
         if not self.used:
@@ -145,9 +145,9 @@ class Gyroscope:
         return f"turns of {self.used} images were expected by its gyroscope"
 
     def turn(self, begin_ns: int, end_ns: int) -> Turn | None:
-        """Return how the camera turned between two times; None if it is not known.
+        """Return the camera's rotation between two times; None if unknown.
 
-        While the begin stays the same, only what is new is integrated.
+        While `begin_ns` stays the same, only new readings are integrated.
         """
         if self.left_out:
             return None
@@ -169,15 +169,15 @@ class Gyroscope:
         return self._excess * (turn.by_bias @ self._unsure @ turn.by_bias.T + own)
 
     def interrupt(self) -> None:
-        """Compare no turn with one across this time: the images were lost, or begin a new world."""
+        """Compare no turn that spans this time: the images were lost, or begin a new world."""
         self._window = None
 
     def learn(
         self, turn: Turn | None, before: NDArray[np.float64], now: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> None:
-        """Compare a turn with that of images.
+        """Compare a turn with the images' turn.
 
-        before, now: (3, 3) R_map_camera at its begin and end by the images. covariance: (3, 3) of the last in square
+        before, now: (3, 3) R_map_camera at its beginning and end by the images. covariance: (3, 3) of `now` in square
         radians, along the map's axes.
         """
         if turn is None:
@@ -194,7 +194,7 @@ class Gyroscope:
         self._compare(whole, rotation_vector(whole.R.T @ shown), now.T @ (first + covariance) @ now, float(most))
 
     def _compare(self, turn: Turn, error: NDArray[np.float64], shown: NDArray[np.float64], most: float) -> None:
-        """Take in by how much the images turned more, (3,) with covariance (3, 3); most: radians of the turn."""
+        """Update with the excess turn of the images, (3,) with covariance (3, 3); most: radians of the turn."""
         if most >= TURNED:
             self._off = FADES * self._off + float(np.linalg.norm(error))
             self._turned = FADES * self._turned + most
@@ -215,7 +215,7 @@ class Gyroscope:
 
 
 def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
-    """Return the IMU of a recording or camera that is tracked, and a line about it; None and "" if it has none."""
+    """Return the IMU of a tracked recording or camera, and a line about it; None and "" if it has none."""
     try:
         imu = imu_of(stream)
     except SourceError as error:
@@ -227,18 +227,18 @@ def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
 
 
 class UpEstimate(NamedTuple):
-    """Which way is up. direction: (3,) unit vector in the camera's frame. off: radians by which it may be wrong."""
+    """The up direction. direction: (3,) unit vector in the camera's frame. off: radians by which it may be wrong."""
 
     direction: NDArray[np.float64]
     off: float
 
 
 def up_by_force(imu: Imu, stamp_ns: int) -> UpEstimate | None:
-    """Return which way is up at a time by the accelerometer.
+    """Return the up direction at a time by the accelerometer.
 
-    By the readings around it, turned by the gyroscope: at rest they feel what holds the camera up, and so they do on
-    the average, since no camera gets faster and faster. None if there are too few, their mean has not the length of
-    gravity, or their halves say different things.
+    Uses the readings around it, rotated by the gyroscope: at rest they measure the force that holds the camera up, and
+    so does their average in motion, because no camera accelerates forever. None if there are too few, their mean is not
+    as long as gravity, or their halves disagree.
     """
     readings = imu.between(stamp_ns - round(AROUND_S * 1e9), stamp_ns + round(AROUND_S * 1e9))
     felt = np.isfinite(readings.specific_force).all(axis=1)
@@ -264,7 +264,7 @@ def up_by_force(imu: Imu, stamp_ns: int) -> UpEstimate | None:
 def _rest(
     seconds: NDArray[np.float64], force: NDArray[np.float64], rate: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return the mean force (3,) while the camera was at rest, nearest to second 0; None if it never was."""
+    """Return the mean force (3,) while the camera was at rest, nearest to second 0; None if it never rested."""
     begins = np.arange(seconds[0], seconds[-1] - AT_REST_S + 1e-9, AT_REST_S / 4)
     for begin in sorted(begins, key=lambda begin: abs(begin + AT_REST_S / 2)):
         part = (seconds >= begin) & (seconds <= begin + AT_REST_S)
@@ -275,7 +275,7 @@ def _rest(
 
 
 def _attitudes(readings: ImuReadings, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 3, 3), which turn from the camera at each reading into the camera at second 0."""
+    """Return rotations (N, 3, 3) from the camera at each reading to the camera at second 0."""
     rates = readings.angular_rate @ readings.T_sensor_imu[:3, :3].T
     steps = np.diff(seconds)[:, None] * (rates[1:] + rates[:-1]) / 2
     R = np.empty((len(seconds), 3, 3))

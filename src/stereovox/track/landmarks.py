@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corners followed through the images of one camera, each with a distance, and the views from which they were seen."""
+"""Corners tracked through one camera's images, each with a distance, and keyframes of where they were seen."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from stereovox.track.sightings import AGREED, Corners, Sightings
 from stereovox.track.views import is_new
 
 NUMBER, APART_PX = 400, 12
-"""Corners that are followed at most, and pixels between new ones."""
+"""Most corners that are tracked, and pixels between new ones."""
 VIEW_M, VIEW_RAD, VIEWS = 1.0, np.radians(15), 100
-"""Views this far apart are kept, to find the way back from; so many, the latest."""
+"""Least distance between kept views, used for relocalization; only the latest are kept, this many."""
 NEAREST_M = 0.3
-"""Depth below which landmarks are not followed on."""
+"""Depth below which landmarks are dropped."""
 TRIED = 4
-"""Kept views that are tried when lost: those with most in common."""
+"""Number of kept views tried when lost, the best matches first."""
 
 Distances = Callable[
     [NDArray[np.float32], NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 ]
-"""Measures corners: takes their pixels (N, 2) and guessed inverse depths (N,) in 1/m, 0 for none; returns inverse
-depths (N,), their standard deviations (N,), and which are measured at all."""
+"""Measures corners: takes pixels (N, 2) and guessed inverse depths (N,) in 1/m, 0 for none; returns inverse
+depths (N,), their standard deviations (N,), and which of them were measured."""
 
 
 class Sight(NamedTuple):
@@ -41,7 +41,7 @@ class Sight(NamedTuple):
 
 
 class View(NamedTuple):
-    """What an image showed: its pose, its corners, and ORB descriptors of these (N, 32)."""
+    """A kept view: its pose, its corners, and their ORB descriptors (N, 32)."""
 
     T: Transform
     corners: Corners
@@ -49,11 +49,11 @@ class View(NamedTuple):
 
 
 class Landmarks:
-    """Corners that are followed from image to image; each has an inverse distance that its looks improve.
+    """Corners tracked from image to image; each observation improves a corner's inverse distance.
 
     Args:
         camera: The camera that takes the images, without distortion.
-        kind: Which corners.
+        kind: Kind of corners to track.
     """
 
     def __init__(self, camera: PinholeCamera, kind: Kind):
@@ -61,12 +61,12 @@ class Landmarks:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all that was learned."""
+        """Forget everything learned."""
         self._corners, self._views = Corners(), list[View]()
         self._image, self._filled = np.empty((0, 0), np.uint8), 0
 
     def follow(self, sight: Sight, expected: Transform) -> Sightings:
-        """Return the landmarks that are found in an image taken near T_world_camera."""
+        """Return the landmarks found in an image taken near T_world_camera."""
         corners = self._corners
         corners = corners.those(corners.in_camera(expected)[:, 2] > NEAREST_M * corners.inverse)
         if not len(corners):
@@ -77,7 +77,7 @@ class Landmarks:
         return Sightings(self.camera, corners, measured, deviation, len(self._corners)).those(found & good)
 
     def advance(self, sight: Sight, followed: Sightings, T: Transform) -> None:
-        """Go on from an image at T_world_camera: better distances of what was followed into it, and new corners."""
+        """Advance to an image at T_world_camera: improve the distances of tracked corners and add new ones."""
         self._corners = followed.improved(T)
         self._image = sight.image
         new = self._new(sight, T)
@@ -86,13 +86,13 @@ class Landmarks:
             self._filled = len(self._corners)
 
     def keep(self, sight: Sight, T: Transform) -> None:
-        """Keep the view from T_world_camera, from which was gone on just now, if it is new."""
+        """Keep the view from T_world_camera, just passed to `advance`, if it is new."""
         if is_new([view.T for view in self._views], T, VIEW_M, VIEW_RAD):
             which, descriptors = described(sight.image, self._corners.pixels)
             self._views = [*self._views[1 - VIEWS :], View(T, self._corners.those(which), descriptors)]
 
     def seek(self, sight: Sight) -> list[tuple[Transform, Sightings]]:
-        """Return what an image has in common with the kept views that it shares most corners with, and their poses."""
+        """Return the poses of the kept views that share most corners with an image, and the shared landmarks."""
         pixels = strongest(sight.image, NUMBER, APART_PX / 2, sight.mask, self._kind)
         which, descriptors = described(sight.image, pixels)
         measured, deviation, good = _measured(sight, pixels[which], np.zeros(len(which)))
@@ -107,7 +107,7 @@ class Landmarks:
         ]
 
     def _new(self, sight: Sight, T: Transform) -> Corners:
-        """Return new landmarks, away from those that there are."""
+        """Return new landmarks, away from existing ones."""
         if len(self._corners) > (1 - self._kind.fewer) * self._filled:
             return Corners()
         wanted = NUMBER - len(self._corners)
@@ -126,7 +126,7 @@ class Landmarks:
 def _measured(
     sight: Sight, pixels: NDArray[np.float32], guess: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return corners as measured (N, 3): pixels and inverse depth; its deviation (N,), and which can be used."""
+    """Return measured corners (N, 3): pixels and inverse depth; its deviation (N,), and which are usable."""
     inverse, deviation, good = sight.distances(pixels, guess)
     column, row = np.clip(np.rint(pixels), 0, np.array(sight.mask.shape[::-1]) - 1).astype(int).T
     return np.column_stack([pixels, inverse]).astype(float), deviation, good & (sight.mask[row, column] > 0)

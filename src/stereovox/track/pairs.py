@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo pairs: landmarks whose distances the other eye tells."""
+"""Stereo pairs: landmarks whose distances are measured by the other eye."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 
 ROWS_PX, MIN_DISPARITY, DISPARITY = 1.5, 0.2, 0.3
-"""Pixels by which rows of both eyes may differ, and the least disparity and its standard deviation."""
+"""Largest row difference between the eyes, least disparity, and its standard deviation, in pixels."""
 SEARCH = np.repeat([0.5, 3.0], 3)
 """Radians and metres around a kept view in which the pose is sought."""
 
@@ -34,10 +34,10 @@ class Eyes(NamedTuple):
 
 
 class Pairs:
-    """Evidence of a stereo pair: corners, followed from image to image and into the other eye.
+    """Evidence of a stereo pair: corners tracked from image to image and into the other eye.
 
-    The pose is that from which the landmarks are seen where they are, and at the distances that they have, by robust
-    least squares from what most of them agree on.
+    The pose is found by robust least squares on the landmarks' pixels and distances, starting from the pose that most
+    of them agree on.
 
     Args:
         pair: The pair, with a pinhole camera.
@@ -73,39 +73,39 @@ class Pairs:
         return Sight(frame.left, mask, partial(self._distances, Eyes(frame.left, frame.right)))
 
     def count(self, seen: Sight) -> None:
-        """Do nothing: what of a pair cannot be used is refused."""
+        """Do nothing: unusable pairs are refused."""
 
     def picture_use(self) -> str:
-        """Return "": what of a pair cannot be used is refused."""
+        """Return "": unusable pairs are refused."""
         return ""
 
     def forget(self) -> None:
-        """Forget all that was learned."""
+        """Forget everything learned."""
         self._landmarks.forget()
         self._followed = Sightings(self._camera)
 
     def fit(self, seen: Sight, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose from which the landmarks are seen where they are; `doubt` as in `solve_stages`."""
+        """Return the pose that explains where the landmarks are seen; `doubt` as in `solve_stages`."""
         self._followed = self._landmarks.follow(seen, expected)
         return _fit(self._followed, expected, doubt)
 
     def advance(self, seen: Sight, T: Transform) -> None:
-        """Go on from an image at T_world_camera: better distances of what was followed into it, and new corners."""
+        """Advance to an image at T_world_camera: improve the distances of tracked corners and add new ones."""
         self._landmarks.advance(seen, self._followed, T)
         self._followed = Sightings(self._camera)
 
     def learn(self, seen: Sight, T: Transform) -> None:
-        """As `advance`, and keep the view where it is new."""
+        """As `advance`, and keep the view if it is new."""
         self.advance(seen, T)
         self._landmarks.keep(seen, T)
 
     def seek(self, seen: Sight, last: Transform) -> list[Fit]:
-        """Return how an image fits at the kept views that it has most corners in common with."""
+        """Return how an image fits at the kept views that share most corners with it."""
         self._followed = Sightings(self._camera)
         return [_fit(found, T, np.diag(SEARCH**2)) for T, found in self._landmarks.seek(seen)]
 
     def doubted(self, seen: Sight, fit: Fit) -> str:
-        """Return what speaks against the pose of an image that follows: landmarks that agree on another one."""
+        """Return an objection to the pose of a tracked image: landmarks that agree on another one; "" if none."""
         return ""
 
     def ambiguous(self, seen: Sight, T: Transform, known: float) -> str:
@@ -113,7 +113,7 @@ class Pairs:
         return ""
 
     def contradicted(self, seen: Sight, T: Transform) -> str:
-        """Return "": corners that fit by their looks are seldom anywhere else."""
+        """Return "": corners that match by descriptor are rarely elsewhere."""
         return ""
 
     def _distances(
@@ -131,5 +131,5 @@ def _fit(found: Sightings, expected: Transform, doubt: NDArray[np.float64]) -> F
     if len(found) < AGREED:
         return Fit(expected, doubt, 0.0, 0.0)
     stages = [Stage(found.equations(reach), CONVERGED) for reach in REACHES]
-    T, covariance = solve_stages(stages, expected, doubt, found.agreed(expected))  # from there where they agree on none
+    T, covariance = solve_stages(stages, expected, doubt, found.agreed(expected))  # else from `expected`
     return Fit(T, covariance, len(found) / max(found.sought, 1), found.inlier_share(T))

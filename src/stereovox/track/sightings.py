@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Landmarks found in an image, and what the places where they are seen say of the camera's pose."""
+"""Landmarks found in an image, and the camera pose that follows from them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from stereovox.track._sightings import equations
 from stereovox.track.fit import Equations
 
 PIXEL = 0.3
-"""Standard deviation of a corner's place in pixels."""
+"""Standard deviation of a corner's position in pixels."""
 USUAL = 16.0
-"""Squared deviations within which a landmark is where it should be, of three residuals."""
+"""Largest squared deviation of an inlier, over three residuals."""
 ALIKE = 2.0
-"""Landmarks whose errors are alike, so that they tell no more than one."""
+"""Number of landmarks with correlated errors, which count as one."""
 REACHES, CONVERGED = (1e2, 9.0), 1e-5
-"""Squared deviations at which a landmark begins to count little, stage by stage, and the step that ends each."""
+"""Squared deviations at which a landmark's weight drops, stage by stage, and the step that ends each stage."""
 NEAR, AGREED = 6.7, 15
-"""Inverse distance of landmarks that find the pose, in deviations of one look at it, and how many must agree."""
+"""Least inverse distance, in deviations of one observation, of landmarks used to find the pose; fewest that agree."""
 LOOKS = 6
-"""Looks at one landmark that improve its distance: later ones err alike."""
+"""Observations that improve a landmark's distance: errors of later ones are correlated."""
 MAX_AGE = 20
-"""Images through which one corner is followed."""
+"""Most images through which one corner is tracked."""
 
 
 @dataclass
 class Corners:
-    """Landmarks, each by the ray on which it was first seen. World frame.
+    """Landmarks, each on the ray on which it was first seen. World frame.
 
     pixels: (N, 2) float32, in the latest image. centre, ray: (N, 3) where that camera was, and the direction with depth
     1. inverse: (N,) 1 / depth along the ray's camera's axis, in 1/m; variance: (N,) of it. looks: (N,).
@@ -52,7 +52,7 @@ class Corners:
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """Return where the landmarks are, (N, 3) metres, world frame."""
+        """Return the positions of the landmarks, (N, 3) metres, world frame."""
         return self.centre + self.ray / self.inverse[:, None]
 
     def those(self, which: NDArray[Any]) -> Corners:
@@ -64,13 +64,13 @@ class Corners:
         return Corners(*(np.concatenate(both) for both in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def in_camera(self, T: Transform) -> NDArray[np.float64]:
-        """Return the landmarks (N, 3) in the frame of a camera at T_world_camera, times their inverse distances."""
+        """Return the landmarks (N, 3) in the frame of a camera at T_world_camera, scaled by their inverse distances."""
         seen = (self.inverse[:, None] * (self.centre - T[:3, 3]) + self.ray) @ T[:3, :3]
         seen[:, 2] = np.maximum(seen[:, 2], 1e-3)
         return seen
 
     def projected(self, camera: PinholeCamera, T: Transform) -> NDArray[np.float64]:
-        """Return where they are seen from T_world_camera: (N, 3) column, row in pixels, inverse depth in 1/m."""
+        """Return their projections seen from T_world_camera: (N, 3) column, row in pixels, inverse depth in 1/m."""
         x, y, z = self.in_camera(T).T
         return np.column_stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, self.inverse / z])
 
@@ -81,10 +81,10 @@ class Sightings:
 
     Attributes:
         camera: The camera that took it.
-        corners: The landmarks, as they were known before.
-        measured: (N, 3) where they are found: column, row in pixels, inverse depth in 1/m.
+        corners: The landmarks, as known before this image.
+        measured: (N, 3) their measured column, row in pixels, inverse depth in 1/m.
         deviation: (N,) standard deviation of that inverse depth.
-        sought: How many landmarks were looked for.
+        sought: Number of landmarks searched for.
     """
 
     camera: PinholeCamera
@@ -103,15 +103,15 @@ class Sightings:
         )
 
     def equations(self, reach: float) -> Equations:
-        """Return the equations of the pose T_world_camera; reach: squares from which a landmark counts little."""
+        """Return the equations of the pose T_world_camera; reach: squared deviations above which weights drop."""
         return partial(self._equations, reach)
 
     def inlier_share(self, T: Transform) -> float:
-        """Return the share of the landmarks that are where they should be, seen from T_world_camera."""
+        """Return the share of inliers among the landmarks, seen from T_world_camera."""
         return float(np.mean(self.residuals(T)[0] < USUAL)) if len(self) else 0.0
 
     def improved(self, T: Transform) -> Corners:
-        """Return landmarks that were found where they should be, with what this look tells of their distances."""
+        """Return the inliers, with distances improved by this observation."""
         corners = self.corners
         if not len(corners):
             return corners
@@ -125,7 +125,7 @@ class Sightings:
         return better.those((squares < USUAL) & (better.looks < MAX_AGE))
 
     def agreed(self, expected: Transform) -> Transform | None:
-        """Return the pose that most landmarks agree on (PnP, RANSAC), sought from the expected one; None: on none."""
+        """Return the pose that most landmarks agree on (PnP, RANSAC), from `expected`; None if there is none."""
         near = self.corners.inverse > NEAR * self.deviation
         if near.sum() < AGREED:
             return None
@@ -154,14 +154,14 @@ class Sightings:
         return information, gradient
 
     def _variances(self) -> NDArray[np.float64]:
-        """Return the variances (N, 3) of what is measured, against what was measured when a landmark was first seen."""
+        """Return the variances (N, 3) of the measurements relative to each landmark's first one."""
         variances = np.full((len(self), 3), 2 * PIXEL**2)
         variances[:, 2] = self.deviation**2
         return variances
 
     def residuals(self, T: Transform) -> tuple[NDArray[Any], ...]:
-        """Return of each landmark: squared deviations (N,), how far off it is (N, 3), the inverse covariance of that
-        (N, 3, 3), the derivatives of its place by the camera's motion (N, 3, 6) and by its inverse depth (N, 3).
+        """Return for each landmark: squared deviation (N,), residual (N, 3), the residual's inverse covariance (N, 3,
+        3), and the derivatives of its projection by the camera's motion (N, 3, 6) and by its inverse depth (N, 3).
         """
         camera, corners, R = self.camera, self.corners, T[:3, :3]
         x, y, z = corners.in_camera(T).T

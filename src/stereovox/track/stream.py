@@ -22,32 +22,31 @@ CURE = "move slower, or back to what was seen before"
 
 
 class AnyTracker(Protocol):
-    """What finds the pose of one frame after the other: `Tracker`, `GuidedTracker`."""
+    """Finds the pose of each frame in turn: `Tracker`, `GuidedTracker`."""
 
     def add(self, frame: AnyFrame, /) -> Tracked:
         """Return the pose of a frame."""
         ...
 
     def expect(self, frame: AnyFrame, /) -> None:
-        """Begin with what can be done of a frame before those that come first have been added."""
+        """Start to prepare a frame before the earlier ones have been added."""
         ...
 
 
 class TrackedStream(Stream):
-    """The frames of a recording or camera with tracked poses; where the camera is lost they have a fault.
+    """The frames of a recording or camera with tracked poses; frames have a fault while tracking is lost.
 
-    The first image is held back until the next one fits it, and then has the
-    start pose. Lost frames have the fault `tracking_lost` and pose NaN. Tracking is deterministic: each iteration
-    begins anew and finds the same poses.
+    The first image is held back until the next one fits it, and then has the start pose. Lost frames have the fault
+    `tracking_lost` and pose NaN. Tracking is deterministic: each iteration starts afresh and finds the same poses.
 
     Args:
         source: The frames.
         make: Returns a new tracker.
         how: How poses are found, for the name.
-        skip: Frames at the start that are tracked, and not delivered.
+        skip: Frames at the start that are tracked but not delivered.
 
     Attributes:
-        name: That of the source, with `, tracked` behind it: its map is not in the world of its own poses.
+        name: The source's name plus `, tracked`: its map is not in the world of its own poses.
     """
 
     def __init__(self, source: Stream, make: Callable[[], AnyTracker], how: str = "tracked", skip: int = 0):
@@ -61,14 +60,14 @@ class TrackedStream(Stream):
 
     @property
     def dropped(self) -> int:
-        """Frames that a live camera delivered and that were not consumed in time."""
+        """Frames that a live camera delivered but that were not consumed in time."""
         return self._source.dropped
 
     def after(self, count: int) -> Stream:
-        """Return the frames from number `count` on; those before are tracked again, to know where the camera is.
+        """Return the frames from number `count` on; earlier ones are tracked again to know the camera's pose.
 
         Raises:
-            SourceError: There are none, or this is a live camera, whose past images are gone.
+            SourceError: There are too few, or this is a live camera, whose past images are gone.
         """
         if self.length is None:
             raise SourceError(f"{self.name}: a live camera does not know where it is in an older map; begin a new one")
@@ -84,13 +83,13 @@ class TrackedStream(Stream):
 
 
 def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[AnyFrame, Tracked]]:
-    """Yield each frame with its tracked pose, or with a fault, and what the tracker said of it.
+    """Yield each frame with its tracked pose or a fault, and the tracker's report.
 
-    The image that the tracker begins with comes once the next one is tracked too, or cannot be.
+    The image that the tracker begins with is yielded once the next one is tracked or lost.
 
     Args:
-        frames: The frames, in the order they were taken; those with a fault of the image itself are handed on as they
-            are, and are lost.
+        frames: The frames, in the order they were taken; frames with a faulty image are passed on unchanged, and are
+            lost.
         tracker: Finds the poses.
     """
     images = iter(frames)
@@ -107,12 +106,12 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
             yield _begun(*waiting, why=waiting[1].lost)
     finally:
         close = getattr(images, "close", None)
-        if close:  # a generator: a live camera is to stop now
+        if close:  # a generator: stop a live camera now
             close()
 
 
 def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
-    """Return a frame with the pose that was tracked, or with the fault `tracking_lost`; as it is where it has one."""
+    """Return a frame with the pose that was tracked, or with the fault `tracking_lost`; unchanged if faulty."""
     if _is_faulty(frame):
         return frame
     if not tracked.lost:
@@ -131,7 +130,7 @@ def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
 
 
 def _begun(frame: AnyFrame, tracked: Tracked, why: str) -> tuple[AnyFrame, Tracked]:
-    """Return the image that the map was begun with: with the start pose, or `why` the next one, and so it, is lost."""
+    """Return the image that the map began with, with the start pose, or lost because the next one is (`why`)."""
     found = replace(tracked, lost=why) if why else replace(tracked, covariance=np.zeros((6, 6)), lost="", begins=False)
     return posed(frame, found), found
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images laid onto the surfaces that the ones before have seen."""
+"""Registration of depth images to surfaces seen earlier."""
 
 from __future__ import annotations
 
@@ -45,56 +45,56 @@ from stereovox.track.views import (
 )
 
 BIAS = 3.0
-"""Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
+"""Depth errors of a real camera that patches do not average out, in standard deviations of one pixel."""
 FLOOR_M = 0.002
 ROWS_PER_METRE, FARTHEST_M = 20.0, 100.0
-"""Of the table of standard deviations."""
+"""Resolution and range of the table of standard deviations."""
 MIN_PATCHES = 150
-"""Patches with a surface that an image needs."""
+"""Fewest patches on surfaces that an image needs."""
 VIEW_M, VIEW_RAD, VIEWS = 0.3, np.radians(15), 1000
-"""Views this far apart are kept, to find the way back from; so many, the latest."""
+"""Least distance between kept views, used for relocalization; only the latest are kept, this many."""
 TRIED = 6
-"""Kept views that are tried when lost: those that look most like the image."""
+"""Number of kept views tried when lost: those most similar to the image."""
 DETAILS = 2
-"""Which of the sizes says whether what tells places apart is known."""
+"""Index of the cell size at which distinctive surfaces are checked."""
 ASIDE = np.radians([0, -25, 25, -50, 50])
-"""By how much the last pose is turned aside where the way back is sought; the first two, the views most alike too."""
+"""Yaw angles tried around the last pose when relocalizing; the first two also around the most similar views."""
 ROUGHLY, ROUGH, CLOSELY, THROUGH = 2, 0.05, 4, 4.0
-"""Of so many patches one is laid roughly, until a step is below this share of a cell; so many poses are then laid
-closely, if they are not the same; what they look through
-counts so many times against them."""
+"""For relocalization: one of this many patches is used for coarse fits, which end at a step below this share of a cell;
+this many distinct poses are then refined; the share of them that looks through
+surfaces counts this many times against them."""
 SAME_M, SAME_RAD = 0.1, np.radians(5)
 SEARCH = np.full(6, 0.4)
-"""Radians and metres around them in which the pose is sought."""
+"""Search region around those poses, in radians and metres."""
 LOOKED_THROUGH = 0.03
-"""Share of what is seen again that may lie where other views looked through: something that moved, not a wall."""
+"""Largest share of re-observed places where other views saw free space: moved objects, not walls."""
 STIR = 0.01
-"""Share of an image that stands where views looked through, from which on what is next to it moves too."""
+"""Share of an image in earlier free space above which its neighbourhood is taken as moving too."""
 DISTURBED, CHECKED_BY, EVERY = 0.03, 3, 4
-"""Share of a view, looked through or standing where others looked, by which something moves or the pose is wrong; in
-so many of the nearest views, by one of so many of their points."""
+"""Share of a view in conflict with free space at which something moves or the pose is wrong; checked in this many of
+the nearest views, at one of this many of their points."""
 ELDERS_RAD, ELDERS_M = np.radians(1.5), 0.03
-"""Standard deviations up to which older surfels hold a pose by themselves."""
+"""Largest standard deviations of a pose that older surfels constrain by themselves."""
 ELDERS_OFF = np.diag(np.repeat([np.radians(0.3), 0.01], 3) ** 2)
-"""Covariance of a pose by older surfels besides its own."""
+"""Covariance added to that of a pose by older surfels."""
 AGREE, APART = 16.0, 100.0
-"""Squared deviations, of six, up to which they must agree while much moves, and while little does."""
+"""Largest squared deviations, of six, of that pose while much moves, and while little moves."""
 CLOSE, QUIETEST = 2.0, 0.01
-"""Where a pose is expected with less than so many times the usual variance, most of an image lies where it should; what
-is far beyond the residuals of that moves, down to this variance of theirs, by what is expected of the camera."""
+"""If a pose is expected with less than this many times the usual variance, most of an image fits. Residuals far beyond
+the others are then taken as motion, down to this share of the camera's expected variance."""
 LENIENT = 1.5
-"""How many times the share of landmarks counts that are where they should be: pictures are seldom taken at the very
-moment of the depth, nor all their rows at once."""
+"""Factor on the share of inlier landmarks: color images are seldom taken at the very moment of the depth, nor all their
+rows at once."""
 STRONG = 40
-"""Landmarks of an image that agree with each other and count against depth that says something else."""
+"""Fewest landmarks that, in agreement with each other, overrule depth."""
 KEPT_M, CHECKED = 15.0, 100
-"""Surfels farther than this along an axis are forgotten, looked for every so many images."""
+"""Surfels farther than this along an axis are dropped, once every this many images."""
 
 
 class Seen(NamedTuple):
-    """What of a frame is used: patches of its depth image, and the image that was taken along, if it can be used.
+    """The used parts of a frame: patches of its depth image, and its color image, if usable.
 
-    why: why that image cannot be used, as that of `sighted_or_why`.
+    why: why that image is unusable, as in `sighted_or_why`.
     """
 
     patches: Patches
@@ -103,7 +103,7 @@ class Seen(NamedTuple):
 
 
 class Surfaces:
-    """Evidence of a depth camera: patches of its images, point to plane on surfels (see `SurfelMap`).
+    """Evidence of a depth camera: point-to-plane registration of patches to surfels (see `SurfelMap`).
 
     Args:
         config: Depth, noise and range are prepared as for a map.
@@ -122,7 +122,7 @@ class Surfaces:
         self._photos, self._free = Photos(), 0.0
 
     def see(self, frame: AnyFrame) -> Seen:
-        """Return what of a frame is used; raises FrameRefused, also if too few patches lie on surfaces."""
+        """Return the used parts of a frame; raises FrameRefused, also if too few patches lie on surfaces."""
         image = self._depth.image(self._depth.matched(replace(frame, T_world_sensor=np.eye(4))))
         sigma_of = self._sigma[image.camera]
         patches = patches_of(image, sigma_of, ROWS_PER_METRE)
@@ -133,7 +133,7 @@ class Surfaces:
         return Seen(patches, *sighted_or_why(photo, image, sigma_of, ROWS_PER_METRE))
 
     def count(self, seen: Seen) -> None:
-        """Take note of an image whose pose is asked for."""
+        """Count an image whose pose is requested."""
         self._photos.count(seen.why)
 
     def _sigma_of(self, camera: VirtualCamera) -> NDArray[np.float64]:
@@ -141,18 +141,18 @@ class Surfaces:
         return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
+        """Return how the color images were used so far, in words; "" if there are none."""
         return self._photos.picture_use()
 
     def forget(self) -> None:
-        """Forget all that was learned."""
+        """Forget everything learned."""
         self._map, self._elders, self._views, self._learned = SurfelMap(), Elders(), [], 0
         self._photos.forget()
 
     def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `solve_stages`.
+        """Return the pose that registers an image to the surfels, near the expected one; `doubt` as in `solve_stages`.
 
-        The landmarks of an image that was taken along hold it as well.
+        The landmarks of a color image constrain it too.
         """
         close = doubt[3:, 3:].trace() < CLOSE * float(np.sum(self.limits.spread[3:] ** 2))
         patches = self._lasting(seen.patches, expected)
@@ -188,7 +188,7 @@ class Surfaces:
         elif held:
             self._photos.agree(T)
             T, covariance = solve_stages(together[-1:], expected, doubt, T)
-        else:  # the landmarks are right to a part of the finest surfels; coarse ones could only contradict them
+        else:  # landmarks are more accurate than the finest surfels; coarse ones could only contradict them
             T, covariance = solve_stages(together[-1:], expected, doubt, seen.T_map_camera)
         return alone._replace(
             T_map_camera=T,
@@ -197,7 +197,7 @@ class Surfaces:
         )
 
     def _lasting(self, patches: Patches, T: Transform) -> Patches:
-        """Return the patches of an image at T_map_camera that do not stand where views saw free space: people walk."""
+        """Return the patches of an image at T_map_camera outside the free space of earlier views: people walk."""
         free = stood_free(patches.points, patches.sigma, T, self._views)
         if np.mean(free) > STIR:
             free = with_edges(free, patches.points, T)
@@ -205,11 +205,11 @@ class Surfaces:
         return Patches(*(np.ascontiguousarray(part[there]) for part in patches))
 
     def advance(self, seen: Seen, T: Transform) -> None:
-        """Follow the corners of an image that was taken along; nothing follows depth that is not learned from."""
+        """Track the corners of a color image; depth that is not learned has nothing to advance."""
         self._photos.advance(seen.sighted, T)
 
     def learn(self, seen: Seen, T: Transform) -> None:
-        """Add an image that is believed to be at T_map_camera."""
+        """Add an image with the accepted pose T_map_camera."""
         self._photos.learn(seen.sighted, T)
         lasting = self._lasting(seen.patches, T)
         self._map.add(lasting, T)
@@ -223,9 +223,9 @@ class Surfaces:
             self._views = [view for view in self._views if np.abs(view.T[:3, 3] - T[:3, 3]).max() < KEPT_M]
 
     def seek(self, seen: Seen, last: Transform) -> list[Fit]:
-        """Return how an image fits at the last pose, turned from it, and near the kept views that look most like it.
+        """Return how an image fits at the last pose, at turns of it, and near the most similar kept views.
 
-        It is laid roughly onto the surfels from each, and closely from those where that fits best.
+        A coarse registration starts from each of them, and a fine one from the best.
         """
         here = view_of(seen.patches.points, seen.patches.sigma, last)
         alike = [view.T for view in sorted(self._views, key=lambda view: unlike(view, here))[:TRIED]]
@@ -245,8 +245,8 @@ class Surfaces:
     def _roughly(
         self, patches: Patches, here: View, places: list[Transform], doubt: NDArray[np.float64]
     ) -> list[Transform]:
-        """Return the poses, apart from each other, near these places at which an image fits best in large cells, and
-        looks through little that was seen.
+        """Return the distinct poses near these places at which an image fits best in large cells and looks through few
+        known surfaces.
         """
         found, kept = list[tuple[float, Transform]](), list[Transform]()
         few = patches.thinned(ROUGHLY)
@@ -261,10 +261,10 @@ class Surfaces:
         return kept
 
     def doubted(self, seen: Seen, fit: Fit) -> str:
-        """Return what speaks against the pose of an image that follows, "" if nothing does.
+        """Return an objection to the pose of a tracked image, "" if there is none.
 
-        Where much of the view is elsewhere than it was, something moves, or the pose is wrong: then older surfels must
-        hold the same pose.
+        If much of the view has changed, something moves or the pose is wrong: then older surfels must support the same
+        pose.
         """
         patches, T = self._lasting(seen.patches, fit.T_map_camera), fit.T_map_camera
         here = view_of(seen.patches.points, seen.patches.sigma, T)
@@ -282,9 +282,9 @@ class Surfaces:
         return "" if held or stir <= DISTURBED else f"{stir:.0%} of the view moves, and the rest does not hold the pose"
 
     def ambiguous(self, seen: Seen, T: Transform, known: float) -> str:
-        """Return why an image may be from another place that is like that at T_map_camera, "" if it is not.
+        """Return why an image may be from another place that resembles T_map_camera, "" if it is not.
 
-        Any corner of a room lies on any other: so much must be known of what is not part of its largest planes.
+        Any two room corners match, so this share must be known of the parts outside the largest planes.
         """
         details = beside_planes(seen.patches)
         if len(details.points) < MIN_PATCHES:
@@ -295,7 +295,7 @@ class Surfaces:
         return f"{level.known:.0%} of what is not on its largest planes is known, {known:.0%} is needed" if few else ""
 
     def contradicted(self, seen: Seen, T: Transform) -> str:
-        """Return what speaks against an image having been taken from T_map_camera, "" if nothing does."""
+        """Return an objection to an image having been taken from T_map_camera, "" if there is none."""
         patches = seen.patches
         share, number = contradiction(view_of(patches.points, patches.sigma, T), self._views)
         if number < MIN_PATCHES:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces seen so far, as surfels in cubic cells of several sizes, and the pose that lays a depth image onto them."""
+"""Surfaces seen so far, as surfels in cubic cells of several sizes, and the registration of depth images to them."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ PATCHES_ACROSS = 80
 SIZES = (0.3, 0.1, 0.05, 0.025)
 """Sizes of cells in metres, from coarse to fine."""
 SLACK = (0.05, 0.015, 0.005, 0.002)
-"""Deviation in metres, for each size, of what lies in one cell without being one plane."""
+"""Deviation from a plane, in metres, of surfaces within one cell of each size."""
 EVERY = (4, 4, 2, 1)
-"""Of so many patches one is used, at each size."""
+"""One of this many patches is used, at each size."""
 SAMPLED = 4
-"""Of so many patches one reports how large the residuals are."""
+"""One of this many patches is sampled to scale the residuals."""
 REACH = 3.0
-"""Standard deviations at which a patch begins to count little."""
+"""Standard deviations above which a patch has little weight."""
 CONVERGED = 0.01
-"""Metres and radians of a step that is the last, as a share of the cells' size."""
+"""Step, in metres and radians, that ends a stage, as a share of the cells' size."""
 AGAIN = 0.1
-"""Share of the cells' size by which a pose moves, in metres and radians, before nearest surfels are sought again."""
+"""Motion of the pose, as a share of the cells' size, after which nearest surfels are searched again."""
 MOST = 5e3
 """Weight at which a surfel becomes a running mean."""
 ALIKE = 2.0
-"""Patches whose errors are alike, so that they tell no more than one: neighbours see the same surfel and share the
-camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
+"""Number of patches with correlated errors, which count as one: neighbours see the same surfel and share the camera's
+own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
 USUAL = 3.0
 """Standard deviations within which a patch agrees with a surfel."""
 MEDIAN = 0.455
-"""Median of the square of a normal number of variance 1."""
+"""Median of the square of a standard normal variable."""
 QUIETEST = 0.01
-"""Least variance of residuals, as a share of the expected one, that is believed."""
+"""Least accepted variance of residuals, as a share of the expected one."""
 BENT = 0.05
-"""Radians by which normals of a plane may be bent together, by the camera's own distortion: that holds nothing."""
+"""Radians by which camera distortion may bend a plane's normals; information of that size is subtracted."""
 ELDER, LAG = 1, 30
-"""Which of the sizes surfels have that are not younger than so many images, and that many."""
+"""Index of the cell size of older surfels, and their least age in images."""
 OWN = np.diag(np.repeat([0.1, 0.1], 3) ** 2)
-"""Covariance of where those may ask a pose to be: wide."""
+"""Prior covariance of a pose by older surfels: wide."""
 PLANES, PLANE, GUESSES, ALONG, THICK_M = 5, 0.04, 60, np.float32(0.94), np.float32(0.04)
-"""Largest planes of a view: how many, their least share of it, how many are tried, the least cosine of normals and the
-half thickness in metres of one."""
+"""Largest planes of a view: their number, least share of it, number of trials, least cosine of normals, and half
+thickness in metres."""
 FIRST = 1 << 14
-"""Places in a new table."""
+"""Slots in a new table."""
 
 
 class Patches(NamedTuple):
@@ -85,7 +85,7 @@ def patches_of(image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre:
 
 
 def beside_planes(seen: Patches) -> Patches:
-    """Return the patches of an image that do not lie on its largest planes: floor, walls, ceiling."""
+    """Return the patches of an image outside its largest planes: floor, walls, ceiling."""
     few = seen.thinned(2)
     offset = np.einsum("ni,ni->n", few.points, few.normals)
     left = np.ones(len(few.points), bool)
@@ -107,7 +107,7 @@ class Surfels:
         self.size, self.number = np.float32(size), 0
         self._keys = np.full(FIRST, EMPTY)
         self._surfels = np.zeros((FIRST, FIELDS), np.float32)
-        self.forget(np.zeros(3), 1.0)  # compiled now, not in the middle of a run
+        self.forget(np.zeros(3), 1.0)  # compile now, not in the middle of a run
         carry(self._keys[:0], self._surfels[:0], self._keys[:0].copy(), self._surfels[:0].copy())
 
     def add(self, seen: Patches, T: Transform) -> None:
@@ -131,9 +131,9 @@ class Surfels:
     def equations(
         self, seen: Patches, slots: NDArray[np.int64], T: Transform, slack: float, reach: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
-        """Return information (6, 6), less what bent normals hold, and gradient (6,): `_surfels.equations`.
+        """Return information (6, 6), less the part due to bent normals, and gradient (6,): `_surfels.equations`.
 
-        Also the squared residuals, by their variance, of the patches that have a surfel.
+        Also the squared residuals, over their variance, of the patches that have a surfel.
         """
         information, gradient, spread = np.zeros((6, 6)), np.zeros(6), np.zeros(10)
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
@@ -174,17 +174,17 @@ class SurfelMap:
     def levels(self, seen: Patches, quietest: float = 1.0) -> list[Level]:
         """Return the equations of an image on the surfels of each size, from coarse to fine.
 
-        quietest: what is far beyond the residuals that most patches have at the expected pose counts little, down to
-            this variance of theirs, by what was expected of it. 1: only what is far beyond that.
+        quietest: residuals far beyond those of most patches at the expected pose have little weight, down to this share
+            of the expected variance. 1: only residuals far beyond the expected variance.
         """
         sizes = zip(self._levels, SLACK, EVERY, strict=True)
         return [Level(level, slack, seen.thinned(every), quietest) for level, slack, every in sizes]
 
 
 class Elders:
-    """Surfels of what was learned a while ago, by which poses on newer ones are checked.
+    """Surfels learned a while ago, which check poses on newer ones.
 
-    Something that moves takes surfels along that were learned from it just now, but none of these.
+    A moving object carries along surfels just learned from it, but none of these.
     """
 
     def __init__(self) -> None:
@@ -192,7 +192,7 @@ class Elders:
         self._waiting: deque[tuple[Patches, Transform]] = deque()
 
     def add(self, seen: Patches, T_map_camera: Transform) -> None:
-        """Add the patches of an image, once `LAG` others have come; at first as many as came before."""
+        """Add the patches of an image once `LAG` others have arrived; early on, once as many as preceded it."""
         self._waiting.append((seen.thinned(2), T_map_camera))
         self._number += 1
         while len(self._waiting) > min(LAG, self._number / 2):
@@ -203,19 +203,19 @@ class Elders:
         self._surfels.forget(centre, radius)
 
     def fit(self, seen: Patches, T_map_camera: Transform) -> Fit:
-        """Return the pose that they ask for, near one; with a wide covariance where they hold none."""
+        """Return the pose that they support, near a given one; its covariance is wide if they constrain none."""
         level = Level(self._surfels, SLACK[ELDER], seen.thinned(SAMPLED), 1.0)
         T, covariance = solve_stages([Stage(level, CONVERGED * level.size)], T_map_camera, OWN)
         return Fit(T, covariance, level.known, level.inlier_share)
 
 
 class Level:
-    """The equations of an image on the surfels of one size.
+    """The equations that register an image to the surfels of one size.
 
     Attributes:
         size: Of the surfels' cells, in metres.
         seen: Patches of the image.
-        ratios: (N,) squared residuals, by their variance, of the patches that had a surfel at the latest pose.
+        ratios: (N,) squared residuals, over their variance, of the patches that had a surfel at the latest pose.
     """
 
     def __init__(self, level: Surfels, slack: float, seen: Patches, quietest: float):
@@ -243,17 +243,17 @@ class Level:
 
     @property
     def inlier_share(self) -> float:
-        """Share of these that agree with it."""
+        """Share of those patches that agree with it."""
         return float(np.mean(self.ratios < USUAL**2)) if len(self.ratios) else 0.0
 
 
 def _scale(ratios: NDArray[np.float32]) -> float:
-    """Return the variance of residuals, by what was expected of it, that most of them show; at most 1."""
+    """Return a robust variance of the residuals, relative to the expected one; at most 1."""
     return float(min(np.median(ratios) / MEDIAN, 1.0)) if len(ratios) else 1.0
 
 
 def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the information (6, 6) that patches with normals in all directions would hold; spread: (10,) moments."""
+    """Return the information (6, 6) that patches with normals in all directions would give; spread: (10,) moments."""
     weight, (x, y, z) = spread[0], spread[1:4]
     xx, xy, xz, yy, yz, zz = spread[4:]
     held = np.zeros((6, 6))

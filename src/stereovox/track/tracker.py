@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of each image from the images themselves, or the word that it is lost."""
+"""The pose of each image by odometry on the images themselves, or the report that it is lost."""
 
 from __future__ import annotations
 
@@ -36,45 +36,45 @@ from stereovox.track.views import far_apart
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
 POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
-"""Faults of a frame's own pose, which is not used here."""
+"""Faults of a frame's own pose, which tracking ignores."""
 GIVEN, GIVEN_SHARE = np.repeat([np.radians(0.2), 0.005], 3), 0.05
 """Standard deviations of a given motion: radians and metres, and share of it."""
 GAP, LONGEST = 2.0, 10.0
-"""Times the usual, how long after an image the next may come and be followed as any, and be followed at all."""
+"""Longest gaps between images, in usual intervals, for normal tracking, and for tracking at all."""
 SHORTEST = 0.3
-"""Times the usual, how soon after an image the next must not come if motion is to be told from them."""
+"""Shortest gap between images, in usual intervals, from which motion is estimated."""
 TURNED_AWAY = np.radians(20)
-"""Angle between an image that is found again and what a trusted gyroscope says, beyond four times its doubt: another
+"""Angle between a relocalized image and a trusted gyroscope, beyond four times its uncertainty, that means another
 place that looks alike."""
 RIVAL, RIVAL_M, RIVAL_RAD = 0.5, 0.3, np.radians(15)
-"""Two fits of which one explains this share of what the other does, so far apart: neither is believed."""
+"""If one of two fits this far apart explains this share of what the other does, neither is accepted."""
 SOON, NEAR_M, NEAR_RAD = 90.0, 1.2, np.radians(60)
-"""Times the usual, until when an image that fits this near the last pose that counted is there, and nowhere else that
-looks alike."""
+"""Time since the last accepted pose, in usual intervals, and distance from it, within which an image that fits cannot
+be from another place that looks alike."""
 STAYS = 0.7
-"""Share of what must be known of an image that is found again that must be known of those that confirm it."""
+"""Share of the overlap demanded of a relocalized image that the images confirming it need."""
 LEAP_M, LEAP_RAD, FINE = 0.1, np.radians(4), 0.92
-"""How far a pose may leave the expected one, unless so much of what is known roughly is known closely too."""
+"""How far a pose may leave the expected one, unless this share of the roughly known parts is closely known."""
 FIRST = 3.0
-"""Times the usual spread, from the first image to the second: the camera may be moving."""
+"""Factor on the usual spread from the first image to the second: the camera may be moving."""
 REMEMBERED = 8
-"""Times of images that say how far apart they usually are."""
+"""Image times from which the usual interval is computed."""
 CONFIRMED = 5
-"""Images in a row that must be tracked after a view is found again, without teaching, until poses count."""
+"""Images in a row that must be tracked after relocalization, without learning, until poses count."""
 
 
 class Demand(NamedTuple):
-    """Share of an image that must be known, and of that what must be where it is expected."""
+    """Share of an image that must be known, and the inlier share of that."""
 
     known: float
     inlier_share: float
 
 
 FOLLOWING, RETURNING, NEARBY, FOUND = Demand(0.2, 0.6), Demand(0.5, 0.8), Demand(0.35, 0.8), Demand(0.75, 0.8)
-"""Of an image that follows the one before, that comes late, that is found again soon and near, and later or farther.
+"""For an image that follows directly, arrives late, is relocalized soon and near, and later or farther.
 
-Long after a loss the camera may be anywhere, and two stretches of an aisle that are alike share walls and floor: two
-thirds of what is seen.
+Long after a loss the camera may be anywhere, and two similar stretches of an aisle share walls and floor: two thirds
+of the view.
 """
 
 Seen = TypeVar("Seen")
@@ -88,22 +88,22 @@ class Evidence(Protocol[Seen]):
     limits: Limits
 
     def see(self, frame: AnyFrame, /) -> Seen:
-        """Return what of a frame is used; raises FrameRefused if it cannot be.
+        """Return the used parts of a frame; raises FrameRefused if it is unusable.
 
-        It changes nothing that the other methods use: it may run in another thread, for frames that never come.
+        It changes no state of the other methods: it may run in another thread, for frames that never arrive.
         """
         ...
 
     def count(self, seen: Seen, /) -> None:
-        """Take note of an image whose pose is asked for."""
+        """Count an image whose pose is requested."""
         ...
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
+        """Return how the color images were used so far, in words; "" if there are none."""
         ...
 
     def forget(self) -> None:
-        """Forget all that was learned."""
+        """Forget everything learned."""
         ...
 
     def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64], /) -> Fit:
@@ -111,30 +111,30 @@ class Evidence(Protocol[Seen]):
         ...
 
     def advance(self, seen: Seen, T: Transform, /) -> None:
-        """Go on from an image at T_map_camera without believing it."""
+        """Advance to an image at T_map_camera without learning from it."""
         ...
 
     def learn(self, seen: Seen, T: Transform, /) -> None:
-        """Take in an image that is believed to be at T_map_camera."""
+        """Learn an image with the accepted pose T_map_camera."""
         ...
 
     def seek(self, seen: Seen, last: Transform, /) -> list[Fit]:
-        """Return how an image fits at places that were seen before; the last pose that was known."""
+        """Return how an image fits at places seen before; last: the last known pose."""
         ...
 
     def doubted(self, seen: Seen, fit: Fit, /) -> str:
-        """Return what speaks against the pose of an image that follows, "" if nothing does."""
+        """Return an objection to the pose of a tracked image, "" if there is none."""
         ...
 
     def ambiguous(self, seen: Seen, T: Transform, known: float, /) -> str:
-        """Return why an image may be from another place that is like that at T_map_camera, "" if it is not.
+        """Return why an image may be from another place that resembles T_map_camera, "" if it is not.
 
-        known: share that must be known of what tells places apart.
+        known: share of its distinctive parts that must be known.
         """
         ...
 
     def contradicted(self, seen: Seen, T: Transform, /) -> str:
-        """Return what speaks against an image having been taken from T_map_camera, "" if nothing does."""
+        """Return an objection to an image having been taken from T_map_camera, "" if there is none."""
         ...
 
 
@@ -143,13 +143,13 @@ class Tracked:
     """The pose of one frame.
 
     Attributes:
-        T_world_sensor: (4, 4) float64, maps the optical frame into the tracker's world; where this one is lost, the
-            last that was followed.
-        covariance: (6, 6) float64 of its place on what was seen so far: rotation about the camera in radians, then
-            position in metres, along the world's axes; infinite where it is lost. Drift since the start is not in it.
+        T_world_sensor: (4, 4) float64, maps the optical frame into the tracker's world; of a lost frame, the last
+            tracked pose.
+        covariance: (6, 6) float64 of its pose relative to what was seen so far: rotation about the camera in radians,
+            then position in metres, along the world's axes; infinite if lost. Drift since the start is not included.
         lost: Why the pose is not known, in words; "" if it is.
-        begins: Whether a map is begun with this image: it is lost until the next one fits it.
-        believed: Whether the pose is that of a given motion alone, since nothing known was in view.
+        begins: Whether a map begins with this image: it is lost until the next one fits it.
+        believed: Whether the pose follows from a given motion alone, because nothing known was in view.
     """
 
     T_world_sensor: Transform
@@ -159,31 +159,31 @@ class Tracked:
     believed: bool = False
 
     def moved(self, T_to_world: Transform) -> Tracked:
-        """Return the same in another world; T_to_world (4, 4) maps the present one into it."""
+        """Return it in another world; T_to_world (4, 4) maps the present one into it."""
         R = np.kron(np.eye(2), T_to_world[:3, :3])
         covariance = self.covariance if self.lost else R @ self.covariance @ R.T
         return replace(self, T_world_sensor=T_to_world @ self.T_world_sensor, covariance=covariance)
 
 
 class Tracker:
-    """Finds the pose of each depth image or stereo pair by what the ones before have seen.
+    """Finds the pose of each depth image or stereo pair by registering it to the earlier ones.
 
-    Depth images, and pairs with a wide view, are laid onto surfels, point to plane, from coarse to fine; in pinhole
-    pairs corners are followed. Both begin where even motion takes the camera. Where too little is known, or nothing
-    holds the pose along some direction (a bare wall), the frame is lost and teaches nothing; a pose that is open by a
-    little is followed on, else the way back is sought among the views that were kept. A view that is found again counts
-    after some images that agree. Poses that frames bring are not used. All frames come from one camera.
+    Depth images, and pairs with a wide view, are registered to surfels, point to plane, from coarse to fine; in pinhole
+    pairs corners are tracked. Both start from constant velocity. If too little is known, or some direction of the pose
+    is unconstrained (a bare wall), the frame is lost and nothing is learned from it. A pose that is slightly open is
+    tracked on; otherwise the tracker relocalizes among the views that it kept. A relocalized view counts after several
+    images that agree. Poses of the frames are not used. All frames must come from one camera.
 
-    With an IMU, images are expected where its gyroscope turns the camera, once its turns have been found to be those of
-    the images; if they are not, it is left out. Its accelerometer says which way is up.
+    With an IMU, its gyroscope predicts the turn to each image once its turns agree with the images; if they do not, it
+    is left out. Its accelerometer gives the up direction.
 
     Args:
         profile: Profile name, TOML file or `Config`: depth, noise and range are prepared as for a map.
         start: (4, 4) T_world_sensor of the image that the map begins with, the first that the next one fits; without
             it the camera looks along x, level, z up.
         imu: An IMU next to the camera: `ImuReadings` of a recording, or a `LiveImu` that is fed before each frame.
-            `start` is tilted to what its accelerometer says is up, where they differ by more than that may be off: 1
-            degree if the camera stood still around that image, else 5.
+                `start` is tilted to the up direction of its accelerometer if they differ by more than the error of
+                that: 1 degree if the camera stood still around that image, else 5.
         **overrides: Settings that replace those of the profile.
 
     Attributes:
@@ -211,16 +211,16 @@ class Tracker:
         self._see: Ahead[AnyFrame, Any] | None = None
         self._sensor = ""
         self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
-        self._stamps: list[int] = []  # of the last images that were followed
+        self._stamps: list[int] = []  # of the last tracked images
         self._learned, self._sure = 0, np.eye(4)  # the last pose that counted
-        self._adrift = False  # followed, though open along some direction
-        self._counted = False  # whether the pose of the last image that was followed did
-        self._near_ns, self._back = -1, FOUND  # until when the camera cannot be far from its last pose; demand then
-        self._trial: int | None = None  # images until poses count: 0 while following, None while lost
+        self._adrift = False  # tracked, though open along some direction
+        self._counted = False  # whether the pose of the last tracked image did
+        self._near_ns, self._back = -1, FOUND  # until then the camera is near its last pose; demand
+        self._trial: int | None = None  # images until poses count: 0 while tracking, None while lost
 
     @property
     def imu_use(self) -> str:
-        """What was made of the IMU so far, in one line; "" without one."""
+        """How the IMU was used so far, in one line; "" without one."""
         if self._imu is None or self._gyroscope is None:
             return ""
         up = "gave which way is up" if self._felt_up else "did not tell which way is up"
@@ -228,20 +228,20 @@ class Tracker:
         return f"{self._imu.name}: {self._gyroscope.use}; its accelerometer {up}{doubt}"
 
     def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
-        """Return the pose of a frame. Frames come in the order they were taken.
+        """Return the pose of a frame. Add frames in the order they were taken.
 
         Args:
             frame: Depth image or stereo pair; its pose is not used.
-            motion: (4, 4) T_before_now, how the camera moved since the frame before by its wheels or another tracker.
-                It takes the place of even motion, and is believed along directions that nothing in view holds, and
-                where all in view is new; then a frame is lost only where what it sees contradicts what is known.
+            motion: (4, 4) T_before_now, the camera's motion since the frame before by its wheels or another tracker. It
+                replaces constant velocity, and is accepted along unconstrained directions, and if all in view is new;
+                then a frame is lost only if its view contradicts what is known.
 
         Returns:
-            Its pose, or why it is lost: also if the image itself cannot be used. The first image counts once the
-            next is tracked on it.
+            Its pose, or why it is lost: also if the image itself is unusable. The first image counts once the next one
+            is tracked on it.
 
         Raises:
-            StereovoxError: `motion` is no rigid motion.
+            StereovoxError: `motion` is not a rigid motion.
         """
         if motion is not None:
             motion = matrix_of(motion)
@@ -266,10 +266,10 @@ class Tracker:
         return self._follow(self._evidence, seen, frame.stamp_ns)
 
     def expect(self, frame: AnyFrame) -> None:
-        """Begin with what can be done of a frame that `add` will get, in the background, while it has another one.
+        """Start to prepare, in the background, a frame that `add` will get later.
 
-        Poses are the same without. Unlike that of `Mapper` it does so whatever `threads` is. Nothing happens before the
-        first frame is added.
+        It does not change the poses. Unlike `Mapper.expect` it ignores `threads`. Nothing happens before the first
+        frame is added.
 
         Args:
             frame: The very object that `add` will get. It must not change meanwhile.
@@ -278,11 +278,11 @@ class Tracker:
             self._see.begin(frame)
 
     def picture_use(self) -> str:
-        """Return what was made of the pictures next to depth images so far, in words; "" if there are none."""
+        """Return how the color images were used so far, in words; "" if there are none."""
         return self._evidence.picture_use() if self._evidence else ""
 
     def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
-        """Take the pose of an image that a given motion leads to, corrected by what is held in view."""
+        """Take the pose of an image predicted by a given motion, corrected along the constrained directions."""
         expected = self._T @ motion
         way = np.repeat([np.linalg.norm(rotation_vector(motion[:3, :3])), np.linalg.norm(motion[:3, 3])], 3)
         doubt = np.diag(np.square(GIVEN + GIVEN_SHARE * way, dtype=np.float64))
@@ -295,7 +295,7 @@ class Tracker:
         self._motion, self._trial = motion, 0
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         if self._gyroscope is not None:
-            self._gyroscope.interrupt()  # its turn to this image is not among those that are compared
+            self._gyroscope.interrupt()  # its turn to this image is not compared
         if contrary:
             evidence.advance(seen, self._T)
             return self._lost(contrary)
@@ -304,7 +304,7 @@ class Tracker:
         return self._found(believed)
 
     def _begin(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int, why: str = "") -> Tracked:
-        """Start with an image; a start counts once the next image is tracked on it. why: the one before does not."""
+        """Start with an image; it counts once the next is tracked on it. why: reason the one before does not count."""
         evidence.forget()
         evidence.learn(seen, np.eye(4))
         self._level(stamp_ns)
@@ -314,7 +314,7 @@ class Tracker:
         return replace(self._lost(f"{words}; poses count from the next image that fits it"), begins=True)
 
     def _level(self, stamp_ns: int) -> None:
-        """Tilt the start by what the accelerometer says of the image that the map begins with, if it is off by more."""
+        """Tilt the start to the accelerometer's up at the first image, if they differ by more than its error."""
         self._start = self._given_start
         up = None if self._imu is None else up_by_force(self._imu, stamp_ns)
         self._felt_up = up is not None
@@ -326,7 +326,7 @@ class Tracker:
             self._start[:3, :3] = tilt @ self._start[:3, :3]
 
     def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int, demand: Demand = FOLLOWING) -> Tracked:
-        """Take the pose of an image that fits, and learn from it where it is believed."""
+        """Take the pose of an image that fits, and learn from it if it is accepted."""
         later, turn = self._later(stamp_ns), self._turn(stamp_ns)
         if later > GAP:
             demand = RETURNING
@@ -355,13 +355,13 @@ class Tracker:
         return self._found()
 
     def _turn(self, stamp_ns: int) -> Turn | None:
-        """Return how the camera turned by the gyroscope since the last image that was followed; None: not known."""
+        """Return the camera's turn by the gyroscope since the last tracked image; None if unknown."""
         return None if self._gyroscope is None else self._gyroscope.turn(self._stamps[-1], stamp_ns)
 
     def _guesses(self, limits: Limits, stamp_ns: int, later: float, turn: Turn | None) -> list[Guess]:
-        """Return poses that an image may have, the likeliest first, and their covariances (6, 6).
+        """Return candidate poses of an image, the likeliest first, and their covariances (6, 6).
 
-        The turn of a gyroscope that is trusted takes the place of even turning; else it is what is tried next.
+        A trusted gyroscope's turn replaces the constant turn rate; an untrusted one is tried second.
         """
         even, doubt = self._expected(limits, stamp_ns, later)
         if self._gyroscope is None or turn is None:
@@ -375,7 +375,7 @@ class Tracker:
         return [(turned, doubt)]
 
     def _wait(self, evidence: Evidence[Seen], seen: Seen, fit: Fit) -> str:
-        """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
+        """Return why a tracked pose does not count yet: it is open, or was until just before."""
         why = _open(fit, evidence.limits.unsure)
         if not why and self._adrift:
             why = evidence.contradicted(seen, fit.T_map_camera)
@@ -388,19 +388,19 @@ class Tracker:
         return why
 
     def _later(self, stamp_ns: int) -> float:
-        """Return how long after the last image one comes, by how far apart they usually are; before it: infinity."""
+        """Return the time since the last image in usual intervals; infinity if it is negative."""
         if stamp_ns < self._stamps[-1]:
             return np.inf
         inlier_share = self._usual()
         return (stamp_ns - self._stamps[-1]) / inlier_share if inlier_share else 1.0
 
     def _usual(self) -> float:
-        """Return how far apart images usually are, in nanoseconds; 0 if that is not known."""
+        """Return the usual interval between images in nanoseconds; 0 if unknown."""
         apart = np.diff(self._stamps)
         return float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
 
     def _expected(self, limits: Limits, stamp_ns: int, later: float) -> tuple[Transform, NDArray[np.float64]]:
-        """Return where even motion takes the camera until a time, and the covariance (6, 6) of that."""
+        """Return the pose that constant velocity predicts for a time, and its covariance (6, 6)."""
         share = 1.0
         if len(self._stamps) > 1 and later > 0 and stamp_ns > self._stamps[-1]:
             last = self._stamps[-1] - self._stamps[-2]
@@ -410,7 +410,7 @@ class Tracker:
         return self._T @ interpolate(np.eye(4), self._motion, share), self._covariance + np.diag(spread**2)
 
     def _return(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
-        """Go on from the last pose after a short loss, if a trusted gyroscope says how the camera turned; else seek."""
+        """Resume from the last pose after a short loss, if a trusted gyroscope gives the turn; else relocalize."""
         if self._counted and self._later(stamp_ns) <= LONGEST and np.isfinite(self._turned(stamp_ns)[1]):
             self._trial = 0
             tracked = self._follow(evidence, seen, stamp_ns, RETURNING)
@@ -419,13 +419,13 @@ class Tracker:
         return self._seek(evidence, seen, stamp_ns)
 
     def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
-        """Look for an image among what was seen before."""
+        """Relocalize an image among the views kept so far."""
         last, reach = self._turned(stamp_ns)
         fits = sorted(evidence.seek(seen, last), key=lambda fit: -fit.known * fit.inlier_share)
         if not fits:
             return self._lose("not found again: it looks like nothing before")
         if stamp_ns < self._stamps[-1]:
-            self._near_ns = -1  # another clock, or a recording that begins again: nobody knows how long it took
+            self._near_ns = -1  # another clock, or a restarted recording: the time since is unknown
         said = [self._refused(evidence, seen, fit, stamp_ns, last, reach) for fit in fits]
         best, why = next(((fit, why) for fit, why in zip(fits, said, strict=True) if not why), (fits[0], said[0]))
         rivals = [
@@ -445,7 +445,7 @@ class Tracker:
         return self._lost(f"found again; {CONFIRMED} more images must agree")
 
     def _demand(self, fit: Fit, stamp_ns: int) -> Demand:
-        """Return what must be known of an image that fits at a place, by whether the camera can be elsewhere by now."""
+        """Return the demand on an image that fits at a place: higher if the camera can be elsewhere by now."""
         if stamp_ns <= self._near_ns and not far_apart(self._sure, fit.T_map_camera, NEAR_M, NEAR_RAD):
             return NEARBY
         return FOUND
@@ -453,7 +453,7 @@ class Tracker:
     def _refused(
         self, evidence: Evidence[Seen], seen: Seen, fit: Fit, stamp_ns: int, last: Transform, reach: float
     ) -> str:
-        """Return why an image is not believed to be where it fits, "" if it is; last, reach: as of `_turned`."""
+        """Return why an image is not accepted where it fits, "" if it is; last, reach: as from `_turned`."""
         demand, T = self._demand(fit, stamp_ns), fit.T_map_camera
         why = _doubt(fit, demand) or _open(fit, evidence.limits.unsure)
         if not why and far_apart(last, T, np.inf, reach):
@@ -464,7 +464,7 @@ class Tracker:
         return why or ("" if demand is NEARBY else evidence.ambiguous(seen, T, demand.known))
 
     def _turned(self, stamp_ns: int) -> tuple[Transform, float]:
-        """Return the last pose, turned as a trusted gyroscope says, and by how many radians that may be off."""
+        """Return the last pose, turned by a trusted gyroscope, and its possible error in radians."""
         turn = self._turn(stamp_ns)
         if self._gyroscope is None or turn is None or not self._gyroscope.trusted:
             return self._sure, np.inf
@@ -491,7 +491,7 @@ class Tracker:
 
 
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
-    """Return what tracks a camera."""
+    """Return the evidence that tracks a camera."""
     if isinstance(frame, StereoFrame) and isinstance(frame.pair.camera, PinholeCamera):
         from stereovox.track.pairs import Pairs  # needs OpenCV
 
@@ -500,12 +500,12 @@ def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
 
 
 def _seen(evidence: Evidence[Seen], frame: AnyFrame) -> Seen:
-    """Return what of a frame is used, whatever is wrong with its own pose."""
+    """Return the used parts of a frame, whatever is wrong with its own pose."""
     return evidence.see(replace(frame, fault=None, fault_detail="") if frame.fault in POSE_FAULTS else frame)
 
 
 def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand) -> tuple[Fit, str]:
-    """Return how an image fits near a guess, and why it does not, "" if it does."""
+    """Return how an image fits near a guess, and why it is not accepted, "" if it is."""
     fit = evidence.fit(seen, *guess)
     why = _doubt(fit, demand) or _open(fit, evidence.limits.adrift) or _leap(fit, guess)
     why = why or evidence.doubted(seen, fit)
@@ -515,13 +515,13 @@ def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand
 
 
 def _leap(fit: Fit, guess: Guess) -> str:
-    """Return that an image does not fit closely where it leaves what was expected by far, "" otherwise."""
+    """Return the objection to a loose fit far from the expected pose, "" if there is none."""
     far = far_apart(guess[0], fit.T_map_camera, LEAP_M, LEAP_RAD)
     return f"only {fit.fine:.0%} of it fits closely, off from even motion" if far and fit.fine < FINE else ""
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:
-    """Return why a fit is not believed, "" if it is."""
+    """Return why a fit is not accepted, "" if it is."""
     if fit.known < demand.known:
         return f"{fit.known:.0%} of what it sees is known, {demand.known:.0%} is needed"
     if fit.inlier_share < demand.inlier_share:
@@ -530,7 +530,7 @@ def _doubt(fit: Fit, demand: Demand) -> str:
 
 
 def _open(fit: Fit, limit: tuple[float, float]) -> str:
-    """Return by how much a pose is open, where it is by more than a limit in radians and metres; "" if it is not."""
+    """Return how open a pose is, if beyond a limit in radians and metres; "" if it is not."""
     turn, shift = deviations(fit.covariance)
     if turn > limit[0] or shift > limit[1]:
         return f"what it sees leaves the pose open by {shift:.3f} m and {np.degrees(turn):.1f} degrees"

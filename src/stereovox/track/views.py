@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views kept along the way, to find it again: which look alike, and whether an image belongs where it seems to fit."""
+"""Views kept for relocalization: which are similar, and whether an image belongs where it seems to fit."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from stereovox.track import _views
 GRID = (30, 40)
 """Rows and columns of a view's depths."""
 SMALL = (12, 16)
-"""Places at which views are compared by their looks."""
+"""Grid on which the similarity of views is computed."""
 FEW, NEAR = 4, 12
-"""Views that an image is compared with, the nearest: each time, and where a place must be sure."""
+"""Number of nearest views that an image is compared with: usually, and when a place must be certain."""
 WIDEST = 4.0
-"""Half width and half height of the grid at one metre, at most: of a camera that sees farther aside, what is ahead."""
+"""Half width and half height of the grid at one metre, at most: of a wider camera, the part ahead."""
 TOLERANCE = 0.04
-"""Share of the depth by which what is seen twice may differ, besides four standard deviations."""
+"""Share of the depth by which two observations may differ, besides four standard deviations."""
 DEVIATIONS, SLACK = np.float32(4), np.float32(TOLERANCE)
 EDGE, SAME = 3, 0.06
-"""Places of the grid around what moves that move with it, where their depths differ by no more than this share."""
+"""Radius in the grid within which neighbours of moving points move too, and largest relative depth difference."""
 TURNED_M = 2.0
-"""Metres that a view counts as farther away where it looks across; twice as many where it looks back."""
+"""Metres added to a view's distance if it looks across; twice that if it looks back."""
 
 
 class View(NamedTuple):
-    """What one image saw. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN if there is none.
+    """The depths of one image. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN if there is none.
 
-    nearest: the least of each place of the grid and those around it, infinity if there is none. points: (N, 3)
+    nearest: the least depth in each place of the grid and its neighbours, infinity if none. points: (N, 3)
     float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half
     height of the grid at one metre.
     """
@@ -61,11 +61,11 @@ def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transfor
 def stood_free(
     points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform, views: list[View]
 ) -> NDArray[np.bool_]:
-    """Return which points (N, 3) of an image at T_map_camera stand where near views saw free space.
+    """Return which points (N, 3) of an image at T_map_camera are in the free space of near views.
 
     sigma: (N,) their standard deviations.
 
-    What stands there has come since: it moves, or the pose is wrong.
+    Such a point has moved there since, or the pose is wrong.
     """
     free = np.zeros(len(points), bool)
     for view in nearest_views(views, T, FEW):
@@ -74,9 +74,9 @@ def stood_free(
 
 
 def with_edges(free: NDArray[np.bool_], points: NDArray[np.float32], T: Transform) -> NDArray[np.bool_]:
-    """Return which points (N, 3) of an image are free (N,), or lie next to such on what seems to be the same thing.
+    """Return which points (N, 3) of an image are `free`, or lie next to one on what seems to be the same object.
 
-    Views have holes, and their depths are coarse: of a person who walks in, parts stand where nobody looked before.
+    Views have holes and coarse depths: parts of a person who walks in are where no view looked before.
     """
     view = view_of(points, np.zeros(len(points), np.float32), T)
     row, column, inside = _places(view, points)
@@ -91,7 +91,7 @@ def with_edges(free: NDArray[np.bool_], points: NDArray[np.float32], T: Transfor
 
 
 def passed_through(here: View, views: list[View], number: int, step: int = 1) -> float:
-    """Return the share of what the nearest views saw and an image sees again that the image looks through."""
+    """Return the share of the nearest views' surfaces that an image looks through, of all that it sees again."""
     found = np.array(
         [_seen_through(view, here, float(DEVIATIONS), step) for view in nearest_views(views, here.T, number)]
     )
@@ -99,7 +99,7 @@ def passed_through(here: View, views: list[View], number: int, step: int = 1) ->
 
 
 def nearest_views(views: list[View], T: Transform, number: int) -> list[View]:
-    """Return the views that are nearest to a pose, in metres and by where they look (`TURNED_M`)."""
+    """Return the views nearest to a pose, by distance and viewing direction (`TURNED_M`)."""
     if len(views) <= number:
         return views
     poses = np.array([view.T[:3, 2:] for view in views])
@@ -108,13 +108,13 @@ def nearest_views(views: list[View], T: Transform, number: int) -> list[View]:
 
 
 def is_new(poses: list[Transform], T: Transform, metres: float, radians: float) -> bool:
-    """Return whether a pose is farther from all others than this."""
+    """Return whether a pose is farther than this from all others."""
     away = np.linalg.norm(np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3) - T[:3, 3], axis=1)
     return all(far_apart(T, poses[i], metres, radians) for i in np.flatnonzero(away <= metres))
 
 
 def unlike(one: View, other: View) -> float:
-    """Return how much two views differ at a few places: median metres, infinity where they share too few."""
+    """Return how much two views differ at a few places: median metres, infinity if they share too few."""
     rows, columns = (np.linspace(0, size - 1, small).astype(int) for size, small in zip(GRID, SMALL, strict=True))
     apart = np.abs(one.depth - other.depth)[np.ix_(rows, columns)]
     apart = apart[np.isfinite(apart)]
@@ -128,7 +128,7 @@ def far_apart(one: Transform, other: Transform, metres: float, radians: float) -
 
 
 def turned(T: Transform, angles: NDArray[np.float64]) -> list[Transform]:
-    """Return a camera's pose turned aside by angles in radians, about the axis that points down in its image."""
+    """Return a camera's pose turned by angles in radians about the axis that points down in its image."""
     out = []
     for angle in angles:
         aside = np.eye(4)
@@ -138,9 +138,9 @@ def turned(T: Transform, angles: NDArray[np.float64]) -> list[Transform]:
 
 
 def contradiction(seen: View, views: list[View], deviations: float = 4.0) -> tuple[float, int]:
-    """Return the share of what is seen twice that lies where a view looked through, and how many places are seen twice.
+    """Return the share of twice-seen places that lie in a view's free space, and how many are seen twice.
 
-    Each way: surfaces of the image in front of what the nearest views saw, and theirs in front of what it sees.
+    Both directions count: surfaces of the image in front of the nearest views', and theirs in front of its own.
     """
     pairs = [(a, b) for view in nearest_views(views, seen.T, NEAR) for a, b in ((seen, view), (view, seen))]
     through, same = np.sum([_seen_through(a, b, deviations) for a, b in pairs], axis=0) if pairs else (0, 0)
@@ -148,7 +148,7 @@ def contradiction(seen: View, views: list[View], deviations: float = 4.0) -> tup
 
 
 def _seen_through(one: View, other: View, deviations: float, step: int = 1) -> tuple[int, int]:
-    """Return how many points of one view the other looks through, and how many it sees as well; every `step`th."""
+    """Return how many of every `step`th point of one view the other looks through, and how many it confirms."""
     found = np.zeros(2, np.int64)
     into = _into(other, one.T)
     _views.seen_through(one.points, one.sigma, *into, other.depth, np.float32(deviations), SLACK, step, found)

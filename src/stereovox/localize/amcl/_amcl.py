@@ -7,18 +7,18 @@ from stereovox.kernels._jit import cell, kernel
 
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 SAFE = np.float32(1.4143)
-"""Two points are nearer to each other than the middles of their cells by a diagonal at most."""
+"""The distance of two points is less than that of their cells' centres by at most this diagonal."""
 NUDGE, GROW = np.float32(1e-3), np.float32(1.000001)
-"""A step over a cell's border, also far out, where float32 no longer knows a thousandth."""
+"""A step across a cell's border, even far out, where float32 cannot resolve a thousandth."""
 LEVEL, FAR = np.float32(1e-6), np.float32(1e9)
 
 
 @kernel
 def sum_at_ends(poses, ends, table, out):
-    """Add up what a table holds where the beams of each pose end.
+    """Sum the table's values at the beam ends of each pose.
 
     poses: (N, 4) float32 column, row, cosine and sine of yaw; ends: (K, 2) float32 in the robot's frame; table: (rows,
-    columns) float32, its border stands for all that lies outside; out: (N,) float32.
+    columns) float32, its border represents everything outside; out: (N,) float32.
     """
     bottom, right = np.float32(table.shape[0] - 1), np.float32(table.shape[1] - 1)
     for i in range(poses.shape[0]):
@@ -35,7 +35,7 @@ def sum_at_ends(poses, ends, table, out):
 
 @kernel
 def count_above(poses, ends, table, least, out):
-    """Count for each beam the poses it ends for where the table holds `least` or more; arguments as above, out (K,)."""
+    """Count, for each beam, the poses whose beam end has `least` or more in the table; arguments as above, out (K,)."""
     bottom, right = np.float32(table.shape[0] - 1), np.float32(table.shape[1] - 1)
     for j in range(ends.shape[0]):
         count = np.int32(0)
@@ -50,11 +50,12 @@ def count_above(poses, ends, table, least, out):
 
 @kernel
 def sum_of_casts(poses, origin, directions, clear, farthest, per_bin, table, out):
-    """Add up what a table holds for how far each beam of each pose can go in the map.
+    """Sum the table's values for the expected length of each beam of each pose.
 
     poses: as above; origin: (2,) float32 of the sensor in the robot's frame; directions: (K, 2) float32, of length one;
-    clear: (rows, columns) float32 cells to the nearest occupied one; farthest: (K,) float32, where beams end at last;
-    per_bin: (K,) float32, bins of the table for each cell of length; table: (K, bins) float32; out: (N,) float32.
+    clear: (rows, columns) float32 cells to the nearest occupied one; farthest: (K,) float32, the longest length of each
+    beam;
+    per_bin: (K,) float32, bins of the table per cell of length; table: (K, bins) float32; out: (N,) float32.
     """
     last = np.int32(table.shape[1] - 1)
     for i in range(poses.shape[0]):
@@ -72,16 +73,16 @@ def sum_of_casts(poses, origin, directions, clear, farthest, per_bin, table, out
 
 @kernel
 def cast(clear, starts, directions, farthest, out):
-    """Fill (N,) float32 `out` with how far rays from (N, 2) starts (column, row) along (N, 2) directions can go."""
+    """Fill (N,) float32 `out` with the free length of rays from (N, 2) starts (column, row) along (N, 2) directions."""
     for i in range(starts.shape[0]):
         out[i] = _cast(clear, starts[i, 0], starts[i, 1], directions[i, 0], directions[i, 1], farthest)
 
 
 @cell
 def _cast(clear, x, y, u, v, farthest):
-    """Return the way to the middle of a ray's piece in the first occupied cell, or `farthest`.
+    """Return the length to the middle of a ray's segment in the first occupied cell, or `farthest`.
 
-    Far from all obstacles it leaps as far as none can be; near them it goes from cell to cell.
+    Far from obstacles it leaps by the clear distance; near them it steps from cell to cell.
     """
     rows, columns = np.float32(clear.shape[0]), np.float32(clear.shape[1])
     to_right = ONE / u if abs(u) > LEVEL else FAR
@@ -100,16 +101,16 @@ def _cast(clear, x, y, u, v, farthest):
         free = clear[row, column]
         if free == ZERO:
             return min((way + leaves) * HALF, farthest)
-        way = max(leaves * GROW + NUDGE, way + free - SAFE)  # without a branch, which would be hard to predict
+        way = max(leaves * GROW + NUDGE, way + free - SAFE)  # no branch: it would be hard to predict
     return farthest
 
 
 @kernel
 def join(indices, keys, round_, steps, parent):
-    """Fill `parent` (K,) int64 with the number of the first bin of each bin's cluster.
+    """Fill `parent` (K,) int64 with the index of the first bin of each bin's cluster.
 
     indices: (K, 3) int64 of different bins x, y, yaw, in order of their keys (K,) int64 (`particles.bin_keys`);
-    round_: bins once round; steps: (M, 3) int64 to neighbours that belong together.
+    round_: bins per full turn; steps: (M, 3) int64 to neighbours that belong together.
     """
     for i in range(keys.size):
         parent[i] = i
@@ -128,7 +129,7 @@ def join(indices, keys, round_, steps, parent):
 
 @cell
 def _root(parent, i):
-    """Return the first bin of the cluster that bin `i` is known to be in, and shorten the way there."""
+    """Return the root of bin `i`'s cluster, with path compression."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]

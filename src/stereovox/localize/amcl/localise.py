@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive Monte Carlo localisation: where a robot is in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8).
+"""Adaptive Monte Carlo localisation: the pose of a robot in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8).
 
-By hand, because nav2's AMCL is a node of ROS 2, not a library.
+Our own implementation, because nav2's AMCL is a ROS 2 node, not a library.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 LATE = 3
-"""Late scans in a row, in order among themselves, before it is decided which stamps are wrong."""
+"""Consecutive late scans, in order among themselves, before deciding which stamps are wrong."""
 MAX_AT_START = 1_000_000
-"""Particles tried at once where the robot may be anywhere."""
+"""Initial particles if the robot may be anywhere."""
 SETTLED_SHARE, SETTLED_M = 0.95, 0.3
 """The robot is localised once this share of the weight is in one cluster of this standard deviation in metres."""
 
@@ -47,7 +47,7 @@ def localise(
 ) -> Track:
     """Return a robot's track through a map; untrusted scans are left out and counted in `Track.refused`.
 
-    start, seed: as in `Localiser`; progress: called with the number of scans done. Where the particles disagree, the
+    start, seed: as in `Localiser`; progress: called with the number of scans done. While the particles disagree, the
     track follows the odometry, with the drift interpolated between the certain poses before and after; before the first
     certain pose it has that one's drift. Scans that later ones show to have a wrong stamp (`Clock`) are removed from
     the track and counted too. Raises what `Localiser` raises, and SourceError if no scan can be trusted.
@@ -90,9 +90,9 @@ class Localiser:
         self._pose_map_odom, self._covariance, self._settled = np.zeros(3), np.zeros((3, 3)), False
 
     def add(self, scan: Scan) -> Estimate:
-        """Estimate where the robot is after one more scan.
+        """Estimate the robot's pose after one more scan.
 
-        Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`validate_scan`,
+        Raises FrameRefused, and changes only the counts, if the scan cannot be trusted (`validate_scan`,
         `check_scan`, `beams_of`) or is not later than the one before (`Clock`).
         """
         start = perf_counter()
@@ -151,7 +151,7 @@ class Localiser:
         self._weights = _times(self._weights, log_likelihood * self.config.trust)
 
     def _fitting(self, beams: Beams) -> Beams:
-        """Return the beams that enough particles agree with, or all of them (`amcl.beam_skip`)."""
+        """Return the beams that fit for enough particles, or all of them (`amcl.beam_skip`)."""
         if not (self.config.beam_skip and self._settled):
             return beams
         lost = self._sensor.agreeing(self._particles, beams) < self.config.beam_skip_share
@@ -177,7 +177,7 @@ class Localiser:
         self._weights = np.full(len(self._particles), 1 / len(self._particles))
 
     def _strangers(self, share: float, beams: Beams) -> tuple[se2.Pose, NDArray[np.float64]]:
-        """Return poses from anywhere, and how likely each is by the scan alone (Lenser and Veloso 2000)."""
+        """Return poses from anywhere, and their likelihoods from the scan alone (Lenser and Veloso 2000)."""
         tried = self.config.candidates
         count = int(np.clip(np.ceil(share * len(self._particles)), 50, 5000)) * tried
         poses = self._floor.anywhere(count, self._rng)
@@ -190,15 +190,15 @@ class Localiser:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where the robot is after a scan, as ROS's amcl gives it.
+    """The robot's pose after a scan, as ROS's amcl reports it.
 
     pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
-    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
-    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
+    covariance: (3, 3) float64, mean squared deviation of all clusters' particles from it (metres, radians).
+    pose_map_odom: (3,) float64, the transform from odometry to map.
     particles: (N, 3) float64, equally likely poses in the map, as of the last update.
-    moved: reports whether the scan was compared with the map: at first, and then after moving far enough.
-    settled: reports whether nearly all particles agree; False while the robot may be in several places.
-    ms: milliseconds the scan took.
+    moved: whether the scan was compared with the map: the first one is, then each after enough motion.
+    settled: whether nearly all particles agree; False while the robot may be in several places.
+    ms: milliseconds spent on the scan.
     """
 
     pose_map_base: se2.Pose
@@ -213,8 +213,8 @@ class Estimate:
 class Clock:
     """Ascending stamps of the scans so far, with recovery from wrong ones.
 
-    A single stamp in the future would make all later scans late. So once more scans in a row are late than there are
-    scans that they would have to precede, the earlier ones had the wrong stamps (as in `slam.pipeline.TrackBuilder`).
+    A single stamp in the future would make all later scans late. So if more consecutive scans are late than there are
+    accepted scans after their stamps, the accepted ones had the wrong stamps (as in `slam.pipeline.TrackBuilder`).
     """
 
     def __init__(self):
@@ -222,7 +222,7 @@ class Clock:
         self._late, self._late_ns = 0, 0
 
     def accept(self, scan: Scan) -> int:
-        """Advance to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
+        """Advance to the time of a scan; return how many of the last scans prove to have a wrong stamp.
 
         Raises FrameRefused with the reason `not_in_order` if the scan is not later than the one before.
         """
@@ -281,7 +281,7 @@ def checked_start(start: ArrayLike) -> NDArray[np.float64]:
 
 
 class _TrackBuilder:
-    """Collects the estimates without their particles, of which hours would not fit into memory."""
+    """Collects the estimates without their particles, which would not fit in memory over hours."""
 
     def __init__(self):
         self.stamps_ns: list[int] = []
@@ -290,7 +290,7 @@ class _TrackBuilder:
         self._sure: list[bool] = []
 
     def add(self, stamp_ns: int, estimate: Estimate) -> None:
-        """Append an estimate; earlier ones of the same time or later are removed (`Clock`)."""
+        """Append an estimate; earlier entries with this stamp or a later one are removed (`Clock`)."""
         while self.stamps_ns and self.stamps_ns[-1] >= stamp_ns:
             for kept in (self.stamps_ns, self._base, self._odom, self._sure):
                 kept.pop()
@@ -311,6 +311,6 @@ class _TrackBuilder:
 
 
 def _times(weights: NDArray[np.float64], log_factors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return weights of sum 1 times the exponentials of log factors."""
+    """Return the weights times the exponentials of log factors, normalized to sum 1."""
     weights = weights * np.exp(log_factors - log_factors.max())
     return weights / weights.sum()

@@ -16,17 +16,17 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 MIN_TRAVEL = 0.01
-"""Metres of travel below which its direction is meaningless: the robot turned on the spot."""
+"""Metres of travel below which its direction is meaningless: the robot turned in place."""
 LENGTHS = 1024
 """Bins of beam length in the beam model, from 0 to the longest."""
 MIN_LEVEL = 1e-6
-"""Metres on the map for one of a beam's length, below which it points straight up or down."""
+"""Horizontal share of a beam's direction below which it points straight up or down."""
 WITNESSES = 500
-"""Particles that vote on whether a beam fits the map."""
+"""Most particles that vote on whether a beam fits the map."""
 
 
 class FieldModel:
-    """Beams should end at obstacles, no matter which (table 6.3); those that met nothing say nothing."""
+    """Likelihood field: beams should end at any obstacle (table 6.3); beams without a return do not count."""
 
     hits_only = True
 
@@ -37,7 +37,7 @@ class FieldModel:
         self._tables: dict[float, NDArray[np.float32]] = {}
 
     def log_likelihood(self, particles: se2.Pose, beams: Beams) -> NDArray[np.float32]:
-        """Return the (N,) float32 log of the product over all beams, for (N, 3) particles; of a density, 1 / metre."""
+        """Return the (N,) float32 log of the product over all beams, for (N, 3) particles; a density, 1 / metre."""
         out = np.empty(len(particles), np.float32)
         poses, ends = _poses(particles, self.field, 1), _in_cells(beams.ends, self.field)
         _amcl.sum_at_ends(poses, ends, self._table(beams.range_max), out)
@@ -55,7 +55,7 @@ class FieldModel:
 
 
 class BeamModel:
-    """Beams should be as long as the map lets them be (table 6.1), found by ray casting."""
+    """Beams should be as long as ray casting in the map predicts (table 6.1)."""
 
     hits_only = False
 
@@ -67,7 +67,7 @@ class BeamModel:
         self._tables: dict[float, NDArray[np.float32]] = {}
 
     def log_likelihood(self, particles: se2.Pose, beams: Beams) -> NDArray[np.float32]:
-        """Return the (N,) float32 log of the product over all beams, for (N, 3) particles; of a density, 1 / metre."""
+        """Return the (N,) float32 log of the product over all beams, for (N, 3) particles; a density, 1 / metre."""
         table, cell = self._table(beams.range_max), self.field.resolution
         bins = table.shape[1] - 1
         row = np.where(beams.at_max, bins + 1, np.rint(beams.ranges * (bins / beams.range_max))).astype(np.int64)
@@ -80,12 +80,12 @@ class BeamModel:
         return out
 
     def agreeing(self, particles: se2.Pose, beams: Beams) -> NDArray[np.float64]:
-        """Return the (K,) share as `FieldModel.agreeing` does; 1 for beams that met nothing."""
+        """Return the (K,) share as `FieldModel.agreeing` does; 1 for beams without a return."""
         fits = _agreeing(particles, beams, self.field, self._near, self.config)
         return np.where(beams.at_max, 1.0, fits)
 
     def _table(self, range_max: float) -> NDArray[np.float32]:
-        """Return the log likelihood by measured range (the last row: nothing met) and expected range."""
+        """Return the log likelihood by measured range (last row: no return) and expected range."""
         if range_max not in self._tables:
             lengths = np.linspace(0, range_max, LENGTHS)
             at_max = np.zeros((LENGTHS + 1, 1), bool)
@@ -97,7 +97,7 @@ class BeamModel:
 
 
 def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArray[np.float64]:
-    """Return first turn, travel and second turn (3,) (radians, metres) that lead from one (3,) pose to the other."""
+    """Return first turn, travel and second turn (3,) (radians, metres) from one (3,) pose to the other."""
     step = se2.relative(pose_odom_before, pose_odom_after)
     way = float(np.hypot(step[0], step[1]))
     first = float(np.arctan2(step[1], step[0])) if way >= MIN_TRAVEL else 0.0
@@ -107,7 +107,7 @@ def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArr
 def deviations(motion: NDArray[np.float64], config: AmclConfig) -> NDArray[np.float64]:
     """Return the (3,) standard deviations of first turn, travel and second turn (table 5.6, with variances).
 
-    A robot that reverses does not turn by 180 degrees twice: a turn counts by its distance from 0 or 180 degrees.
+    A robot that reverses does not turn by 180 degrees twice: a turn counts by its difference from 0 or 180 degrees.
     """
     first, way, second = motion
     turn1, turn2 = (min(abs(turn), np.pi - abs(turn)) for turn in (first, second))
@@ -121,7 +121,7 @@ def deviations(motion: NDArray[np.float64], config: AmclConfig) -> NDArray[np.fl
 
 
 def moved(particles: se2.Pose, motion: NDArray[np.float64], config: AmclConfig, rng: np.random.Generator) -> se2.Pose:
-    """Return (N, 3) particles after a (3,) motion of `turn_go_turn`, each with noise of its own."""
+    """Return (N, 3) particles after a (3,) motion of `turn_go_turn`, each with its own noise."""
     noise = rng.standard_normal((3, len(particles))) * deviations(motion, config)[:, None]
     first, way, second = motion[:, None] - noise
     heading = particles[:, 2] + first
@@ -136,7 +136,7 @@ class DistanceField:
     distance_m: (rows, columns) float32 metres from a cell's middle to the middle of the nearest occupied cell, at most
         `farthest`; 0 in occupied cells.
     resolution, origin: as in `OccupancyGrid`.
-    farthest: metres that stand for anything further away, and for all that lies outside of the map.
+    farthest: cap in metres, also the value everywhere outside the map.
     """
 
     distance_m: NDArray[np.float32]
@@ -174,20 +174,20 @@ MODELS = {"field": FieldModel, "beam": BeamModel}
 
 
 def field_likelihood(distance_m: ArrayLike, range_max: float, config: AmclConfig) -> NDArray[np.float64]:
-    """Return how likely (1 / metre) a beam is that ends so far (metres) from the nearest obstacle (table 6.3)."""
+    """Return the likelihood (1 / metre) of a beam that ends this far (metres) from the nearest obstacle (table 6.3)."""
     return config.z_hit * _normal(np.asarray(distance_m, float), config.sigma_hit) + config.z_rand / range_max
 
 
 def beam_likelihood(
     measured: ArrayLike, at_max: ArrayLike, expected: ArrayLike, range_max: float, config: AmclConfig
 ) -> NDArray[np.float64]:
-    """Return how likely (1 / metre) ranges are where the map lets a beam go `expected` metres (Eq 6.4 to 6.12).
+    """Return the likelihood (1 / metre) of ranges whose expected length is `expected` metres (Eq 6.4 to 6.12).
 
-    measured, expected: metres; at_max: bool, reports which met nothing up to `range_max`. Broadcast against each other.
+    measured, expected: metres; at_max: bool, no return up to `range_max`. Broadcast against each other.
 
-    Beams that met nothing have a probability and no density; it counts as if spread over a metre (table 6.1). Noise
-    that carries a beam beyond `range_max` makes it one of them, so that the whole is 1, as the four shares are divided
-    by their sum.
+    Beams without a return have a probability, not a density; it counts as if spread over a metre (table 6.1). Noise
+    that carries a beam beyond `range_max` makes it one of them. Dividing the four shares by their sum then makes the
+    total 1.
     """
     from scipy.special import ndtr
 

@@ -14,7 +14,7 @@ from stereovox.geometry.se2 import Pose
 from stereovox.localize.amcl import _amcl
 
 NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
-"""Half of a bin's 26 neighbours: the other half has the bin among theirs."""
+"""Half of a bin's 26 neighbours; the other half is covered from the neighbours' side."""
 
 
 class Recovery:
@@ -22,8 +22,8 @@ class Recovery:
 
     strangers: share of particles that should be drawn at random, `max(0, 1 - short / long)`; 0 below `recovery_least`.
 
-    What is remembered is the likelihood per beam: the K-th root of that of K beams, whose own scale would be left to
-    chance. At first both memories are the plain mean of all that was seen, so that a start from anywhere fades.
+    The memories average the likelihood per beam, the K-th root of that of K beams, so that the number of beams does not
+    matter. Early on both are the plain mean of all observations, so that a start from anywhere fades.
     """
 
     def __init__(self, config: AmclConfig):
@@ -50,7 +50,7 @@ class Recovery:
 
 
 def particles_needed(bins: int, error: float, z: float) -> float:
-    """Return how many particles keep a distribution over so many bins within `error` of the true one.
+    """Return how many particles keep a distribution over `bins` bins within `error` of the true one.
 
     error: Kullback-Leibler distance; z: upper quantile of the normal distribution (2.33 for 99 %). Fox 2003, Eq 7.
     """
@@ -61,18 +61,18 @@ def particles_needed(bins: int, error: float, z: float) -> float:
 
 
 def low_variance(weights: NDArray[np.float64], count: int, offset: float) -> NDArray[np.int64]:
-    """Return the (count,) numbers of the particles drawn by (N,) weights of sum 1 (table 4.4).
+    """Return the (count,) indices of particles drawn by (N,) weights of sum 1 (table 4.4).
 
-    offset: 0 to 1, the one random number. Each particle comes `count` times its weight, rounded up or down.
+    offset: 0 to 1, the one random number. Each particle is drawn `count` times its weight, rounded up or down.
     """
     ends = np.cumsum(weights)
     places = (np.arange(count) + offset) * (ends[-1] / count)
-    last = np.searchsorted(ends, ends[-1])  # the last one with weight: rounding may put a place at the very end
+    last = np.searchsorted(ends, ends[-1])  # the last with weight: rounding may reach the very end
     return np.minimum(np.searchsorted(ends, places, side="right"), last)
 
 
 def bin_indices(particles: Pose, config: AmclConfig) -> NDArray[np.int64]:
-    """Return the (N, 3) bins of x, y and yaw that (N, 3) particles fall into; those of yaw go once round."""
+    """Return the (N, 3) bins of x, y and yaw of (N, 3) particles; yaw wraps around."""
     round_ = yaw_bins(config)
     turn = np.floor(particles[:, 2] * (round_ / (2 * np.pi))).astype(np.int64) % round_
     across = np.floor(particles[:, :2] / config.kld_bin).astype(np.int64)
@@ -80,12 +80,12 @@ def bin_indices(particles: Pose, config: AmclConfig) -> NDArray[np.int64]:
 
 
 def yaw_bins(config: AmclConfig) -> int:
-    """Return how many bins go once round: as wide as asked for, or a little wider."""
+    """Return the number of yaw bins in a full turn: of the requested width, or slightly wider."""
     return max(int(360 / config.kld_bin_deg + 1e-9), 1)
 
 
 def bin_keys(indices: NDArray[np.int64], round_: int) -> NDArray[np.int64]:
-    """Return one (N,) number for each (N, 3) bin; `round_` of them go once round. Good for 2^27 bins along x and y."""
+    """Return one (N,) number for each (N, 3) bin; `round_`: bins per full turn. Good for 2^27 bins along x and y."""
     return ((indices[:, 0] << 28) + indices[:, 1]) * round_ + indices[:, 2]
 
 
@@ -97,14 +97,14 @@ def draw(
     strangers: float = 0.0,
     weights_strangers: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the numbers of the particles to keep, and of strangers to take in: as many as their spread asks for.
+    """Return the indices of particles to keep and of strangers to add: as many as their spread requires.
 
-    weights: (N,) of sum 1; bins: (N + M,) int64, a number for the bin of each particle and stranger, counted from 0.
-    strangers: share of the new particles that shall be strangers; weights_strangers: their (M,) weights of sum 1.
+    weights: (N,) of sum 1; bins: (N + M,) int64, bin index of each particle and stranger, from 0.
+    strangers: share of strangers among the new particles; weights_strangers: their (M,) weights of sum 1.
     offset: 0 to 1, the one random number.
 
-    The number grows until it is enough for the bins that were drawn (table 8.4), in rounds instead of one by one,
-    since low variance needs to know it beforehand.
+    The number grows until it suffices for the bins drawn (table 8.4), in rounds instead of one by one, because low
+    variance sampling needs it beforehand.
     """
     few, many = config.particles_min, config.particles_max
     count = few
@@ -122,9 +122,9 @@ def draw(
 
 
 class Clusters:
-    """Particles parted into bins, and these into clusters of bins that touch (also across 360 degrees).
+    """Particles sorted into bins, and bins into clusters of adjacent bins (also across 360 degrees).
 
-    bins: (N,) int64, number of each particle's bin, from 0; cluster: (N,) int64, number of each particle's cluster.
+    bins: (N,) int64, index of each particle's bin, from 0; cluster: (N,) int64, index of each particle's cluster.
     """
 
     def __init__(self, particles: se2.Pose, config: AmclConfig):
@@ -136,21 +136,21 @@ class Clusters:
         self.cluster = joined[self.bins]
 
     def heaviest(self, weights: NDArray[np.float64]) -> tuple[NDArray[np.bool_], float]:
-        """Return which particles are in the heaviest cluster, (N,) bool, and its share of all weight."""
+        """Return which particles are in the heaviest cluster, (N,) bool, and its share of the total weight."""
         sums = np.bincount(self.cluster, weights)
         best = int(sums.argmax())
         return self.cluster == best, float(sums[best] / sums.sum())
 
 
 def mean_pose(particles: se2.Pose, weights: NDArray[np.float64]) -> se2.Pose:
-    """Return the (3,) weighted mean of (N, 3) particles; that of yaw on the circle."""
+    """Return the (3,) weighted mean of (N, 3) particles; yaw as a circular mean."""
     total = weights.sum()
     x, y = weights @ particles[:, :2] / total
     return np.array([x, y, np.arctan2(weights @ np.sin(particles[:, 2]), weights @ np.cos(particles[:, 2]))])
 
 
 def spread(particles: se2.Pose, weights: NDArray[np.float64], pose: se2.Pose) -> NDArray[np.float64]:
-    """Return the (3, 3) mean square of how far (N, 3) weighted particles are from a pose: its covariance."""
+    """Return the (3, 3) weighted mean squared deviation of (N, 3) particles from a pose: its covariance."""
     off = particles - pose
     off[:, 2] = se2.wrapped(off[:, 2])
     return (off * weights[:, None]).T @ off / weights.sum()

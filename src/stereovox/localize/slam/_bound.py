@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels for a search that leaves nothing out: branch and bound over positions and turns (Hess et al. 2016, III)."""
+"""Kernels for an exhaustive search: branch and bound over positions and turns (Hess et al. 2016, III)."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def _total(places, k, row, column, level, pyramid, pad):
 def climb(places, side, pyramid, pad, least, taken, apart, best):
     """Find the turn and shift of a cloud with the largest score, if it is above `least`; return that score.
 
-    places: (turns, N, 2) int32 row and column of each point for every turn tried. side: cells that it may shift each
-    way. best: (3,) int64 turn, rows, columns, written (as it was if nothing is above `least`). Score: the sum of
-    level 0 of `pyramid` over the points. Equal scores: the first in the order of the search, which is always the same.
-    taken, apart: shifts within `apart` cells of those of `taken` (3,) int64 do not count; -1: all do.
+    places: (turns, N, 2) int32 row and column of each point for every turn tried. side: largest shift in cells, in each
+    direction. best: (3,) int64 turn, rows, columns, written (unchanged if nothing is above `least`). Score: the sum of
+    level 0 of `pyramid` over the points. Ties: the first in the fixed order of the search.
+    taken, apart: shifts within `apart` cells of the one in `taken` (3,) int64 are skipped; -1: none are.
     """
     top = pyramid.shape[0] - 1
     stride = 1 << top

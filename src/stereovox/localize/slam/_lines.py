@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that turn the points of many scans into short lines, and a grid that reports which line is near.
+"""Kernels that turn the points of many scans into short lines, and a grid of the nearest line.
 
-All coordinates are metres from the grid's corner. A slot is one cell that holds points; `index` tells its number.
+All coordinates are metres from the grid's corner. A slot is one cell that holds points; `index` holds its number.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from stereovox.kernels._jit import kernel
 ZERO, HALF, ONE, TWO, FOUR = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2), np.float32(4)
 TINY = np.float32(1e-12)
 FEW = np.float32(2.5)
-"""Points that a neighbourhood must have more of, before a line is laid through it."""
+"""A line is fitted only to neighbourhoods with more points than this."""
 ROUND = np.float32(0.12)
-"""Smaller over larger variance from which on a neighbourhood is no line."""
+"""Ratio of the smaller to the larger variance above which a neighbourhood is no line."""
 
 
 @kernel
 def bounds(points, least, most):
-    """Write the lowest and highest x, y of points (N, 2); leaves both as they are if there is none."""
+    """Write the lowest and highest x, y of points (N, 2); leaves both unchanged if there are none."""
     for i in range(len(points)):
         for axis in range(2):
             value = points[i, axis]
@@ -64,11 +64,11 @@ def gather(points, corner, views, cell, index, cells, sums):
 
 @kernel
 def fit(index, cells, sums, cell, radius, fewest, lines):
-    """Lay a line through the points round each slot that were seen from its side.
+    """Fit a line to the points around each slot that were seen from its side.
 
-    radius: cells on each side. fewest: points of a neighbourhood below which nothing is laid onto it.
-    lines: (S, 8) float32: mean of the slot itself x, y; mean of its neighbourhood x, y; the line's normal, for a mere
-    point the direction, towards the sensor x, y; 1 for a line, 0 for a mere point, -1 for too few points; 0.
+    radius: cells on each side. fewest: points of a neighbourhood below which it is not used.
+    lines: (S, 8) float32: mean of the slot itself x, y; mean of its neighbourhood x, y; the line's normal towards the
+    sensor x, y (for a mere point, that direction); 1 for a line, 0 for a mere point, -1 for too few points; 0.
     """
     rows, columns = index.shape
     for slot in range(len(lines)):
@@ -115,8 +115,8 @@ def fit(index, cells, sums, cell, radius, fewest, lines):
 def spread(cells, lines, cell, reach, sigma, near, score):
     """Write into every cell within `reach` cells of a slot the nearest slot, and a likelihood 1 / (1 + (d / sigma)^2).
 
-    d: metres from the cell's middle to the mean of the slot's points; near: (rows, columns) int32, -1 nothing;
-    score: (rows, columns) float32, 0 nothing.
+    d: metres from the cell's middle to the mean of the slot's points; near: (rows, columns) int32, -1 if none;
+    score: (rows, columns) float32, 0 if none.
     """
     rows, columns = near.shape
     narrow = ONE / (sigma * sigma)
@@ -134,7 +134,7 @@ def spread(cells, lines, cell, reach, sigma, near, score):
 
 @kernel
 def wipe(cells, reach, index, near, score):
-    """Undo `gather` and `spread` if they wrote: a grid is large and mostly empty."""
+    """Clear only the cells that `gather` and `spread` wrote: a grid is large and mostly empty."""
     rows, columns = near.shape
     for slot in range(len(cells)):
         row, column = cells[slot, 0], cells[slot, 1]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that lay a scan onto a map of lines: a search over a window, then Gauss-Newton.
+"""Kernels that register a scan to a map of lines: a search over a window, then Gauss-Newton.
 
-By hand, because libraries match clouds of points in 3-D (small_gicp); a floor's scans need lines and three unknowns.
-Poses are float64 here, sums too: a normal matrix of three unknowns loses half of its digits when it is solved.
+Our own, because libraries register 3-D point clouds (small_gicp); a floor's scans need lines and three unknowns. Poses
+and sums are float64 here: solving the 3 x 3 normal matrix loses half of the digits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from stereovox.kernels._jit import allocating_kernel, cell
 
 ZERO, ONE = np.float32(0), np.float32(1)
 FACING = np.float32(0.05)
-"""Cosine between a line's normal and the direction towards the sensor, below which the other side was seen."""
+"""Cosine between a line's normal and the direction towards the sensor, below which its other side was seen."""
 
 
 @allocating_kernel
@@ -56,7 +56,7 @@ def search(points, guess, score, cell, side, side_yaw, step_yaw, slope, slope_ya
 
 @cell
 def _on_line(dx, dy, ax, ay, nx, ny, narrow, normal, gradient):
-    """Add what a point off a line by dx, dy says; return its squared distance from it and its weight.
+    """Add the constraint of a point off a line by dx, dy; return its squared distance to the line and its weight.
 
     ax, ay: from the robot to the point. nx, ny: the line's normal.
     """
@@ -78,7 +78,7 @@ def _on_line(dx, dy, ax, ay, nx, ny, narrow, normal, gradient):
 
 @cell
 def _at_point(dx, dy, ax, ay, point_weight, narrow, normal, gradient):
-    """Add what a point off another one by dx, dy says; return its squared distance from it and its weight."""
+    """Add the constraint of a point off another by dx, dy; return their squared distance and its weight."""
     square = dx * dx + dy * dy
     w = 1.0 / (1.0 + square * narrow)
     w *= w * point_weight
@@ -95,11 +95,11 @@ def _at_point(dx, dy, ax, ay, point_weight, narrow, normal, gradient):
 
 @allocating_kernel
 def refine(points, views, near, lines, cell, sigma, point_weight, prior, information, iterations, pose, normal, cost):
-    """Move `pose` (3,) to where the points lie on the lines, and near `prior`; return how many points are on lines.
+    """Refine `pose` (3,) so that points lie on lines, near `prior`; return how many points are on lines.
 
-    Least squares of the distances over `sigma` metres with Geman and McClure's weights, plus the prior's
-    `information` (3, 3). A point counts where a line seen from the same side is near; at corners, if there is no
-    line, both coordinates count, times `point_weight`.
+    Least squares of the distances over `sigma` metres with Geman and McClure's weights, plus the prior's `information`
+    (3, 3). A point counts if a line seen from the same side is near; at corners without a line both coordinates count,
+    times `point_weight`.
     normal: (3, 3), written: information of the points alone, for x, y, yaw in the grid's frame.
     cost: (2,), written: the weighted mean of the squared distances in m^2, and the sum of weights.
     """

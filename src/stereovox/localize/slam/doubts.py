@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A finished map's self-check: what its own scans say against it.
+"""A finished map's self-check against its own scans.
 
 The limits were chosen on seeds 0 to 99 of `benchmarks/slam_drives.py` and on the logs ACES, MIT-CSAIL and fr079.
 """
@@ -20,22 +20,22 @@ from stereovox.localize.slam.graph import Keyframe
 from stereovox.localize.slam.odometry_check import through
 
 BLOCK, EVERY = 10, 2
-"""Keyframes that are judged together, and the step between those of them that are looked at."""
+"""Keyframes judged together, and the stride of those inspected."""
 VISIT_DISTANCE, VISIT_PATH = 4.0, 8.0
-"""Metres between keyframes that see the same walls, and of way between them, for the two to be visits of their own."""
+"""Largest distance between keyframes that see the same walls, and least path between two separate visits, in metres."""
 MAX_POINT_RANGE = 8.0
-"""Metres from the robot up to which its points are sure enough to speak against other scans."""
+"""Range in metres up to which points are certain enough to contradict other scans."""
 MAX_OTHERS = 6
-"""Keyframes of other visits that one is compared with at most."""
+"""Most keyframes of other visits that one is compared with."""
 MIN_POINTS, CONTRADICTED = 300, 0.4
-"""Points that judge a block at least, and the share of them seen through above which it is doubted: people and doors
+"""Fewest points that judge a block, and the share of them seen through above which it is doubted: people and doors
 move."""
 MIN_SLACK = 0.2
-"""Metres of slack below which a step is not doubted: odometry alone leads well over a few scans."""
+"""Metres of slack below which a step is not doubted: odometry alone is good over a few scans."""
 MIN_PART_PATH = 1.0
-"""Metres of way between two steps with slack, below which they count as one."""
+"""Metres of path between two steps with slack, below which they count as one."""
 STRETCH, BENT, BENT_TURN = 20.0, 0.3, 0.09
-"""Metres of way, and metres and radians by which loops may have bent them: matching is off by some 2 %."""
+"""Metres of path, and metres and radians by which loops may bend it: matching is off by about 2 %."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class MapDoubt:
     """Why a part of a map may be wrong.
 
     kind: `unseen` (matching and odometry contradicted each other, and nothing later shows which was right), `lost`
-    (odometry alone led the robot, and nothing later shows where), `bent` (loops bent a stretch by more than matching
-    can be off), `contradiction` (beams of this part pass through walls that another visit saw). begin_s, end_s: seconds
-    of the drive, from its first keyframe. figure: metres that it may be off by, metres that it was bent by, or the
-    share of points seen through. turn_deg: degrees that it was bent by, 0 for other kinds.
+    (odometry alone carried the robot, and nothing later shows where to), `bent` (loops bent a stretch more than
+    matching errors explain), `contradiction` (beams of this part pass through walls that another visit saw). begin_s,
+    end_s: seconds of the drive, from its first keyframe. figure: metres of possible error or of bending, or the share
+    of points seen through. turn_deg: degrees of bending, 0 for other kinds.
     """
 
     kind: str
@@ -65,7 +65,7 @@ class MapDoubt:
         return asdict(self)
 
     def _bend(self) -> str:
-        """Return metres and degrees, those that are beyond their limits."""
+        """Return metres and degrees, whichever exceed their limits."""
         metres, turn = f"{self.figure:.1f} m", f"{self.turn_deg:.0f} degrees"
         if self.turn_deg <= np.degrees(BENT_TURN):
             return metres
@@ -83,7 +83,7 @@ SENTENCES = {
 
 
 def doubts_of(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> list[MapDoubt]:
-    """Return what speaks against a finished map, in order of time; `edges`: the loops closed."""
+    """Return the doubts about a finished map, in order of time; `edges`: the loops closed."""
     found = [*_unseen(keyframes, edges), *_bent(keyframes), *_contradicted(keyframes)]
     return sorted(found, key=lambda doubt: (doubt.begin_s, doubt.kind))
 
@@ -96,7 +96,7 @@ def _doubt(
 
 
 def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[MapDoubt]:
-    """Yield the steps with slack whose two sides no loop joins: each part between them needs one."""
+    """Yield the steps with slack whose two sides no loop joins."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -115,14 +115,14 @@ def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[Ma
 
 
 def _cuts(keyframes: Sequence[Keyframe]) -> list[int]:
-    """Return the keyframes whose step has slack; of several close to each other the last."""
+    """Return the keyframes whose step has slack; of several close together, the last."""
     slack = [i for i, keyframe in enumerate(keyframes) if keyframe.slack > MIN_SLACK and i]
     way = [keyframe.travelled for keyframe in keyframes]
     return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > MIN_PART_PATH]
 
 
 def _bent(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
-    """Yield the stretch that the graph bent most against what matching said, if it is too much."""
+    """Yield the stretch that the graph bent most relative to matching, if too much."""
     way = np.array([keyframe.travelled for keyframe in keyframes])
     ends = np.minimum(np.searchsorted(way, way + STRETCH), len(way) - 1)
     final = np.array([keyframe.pose for keyframe in keyframes])
@@ -142,7 +142,7 @@ def _chained(keyframes: Sequence[Keyframe]) -> Iterator[se2.Pose]:
 
 
 def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
-    """Yield the block whose points are seen through most, if they are too many."""
+    """Yield the block with the largest share of points seen through, if it is too large."""
     places = np.array([keyframe.pose for keyframe in keyframes])
     way = np.array([keyframe.travelled for keyframe in keyframes])
     worst, where = CONTRADICTED, -1
@@ -160,7 +160,7 @@ def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
 
 
 def _other_visits(places: se2.Pose, way: NDArray[np.float64], i: int) -> NDArray[np.int64]:
-    """Return keyframes near keyframe i that stood there at another time, spread over all of them."""
+    """Return keyframes near keyframe i from other visits, evenly chosen."""
     near = np.hypot(*(places[:, :2] - places[i, :2]).T) < VISIT_DISTANCE
     others = np.flatnonzero(near & (np.abs(way - way[i]) > VISIT_PATH))
     return others[:: max(len(others) // MAX_OTHERS, 1)][:MAX_OTHERS]

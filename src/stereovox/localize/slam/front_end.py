@@ -14,42 +14,42 @@ from stereovox.localize.slam.loops import ClosureSearch
 from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, STUCK_SCALE, Moment, OdometryCheck, through
 
 STEP_YAW = 0.01
-"""Radians between the turns that the search tries."""
+"""Radians between the yaw angles that the search tries."""
 MAX_WINDOW, MAX_WINDOW_TURN = 1.0, 1.5
-"""Metres and radians that are searched at most, whatever the odometry says."""
+"""Largest search window in metres and radians, whatever the odometry reports."""
 MIN_WINDOW = 0.1
-"""Metres that are searched at least."""
+"""Smallest search window in metres."""
 SLOPE = 0.02
-"""Likelihood that the search takes off at one standard deviation of the odometry: so much a scan that moves on along a
-corridor loses against one that stays where it was, as its far points fall between those of before."""
+"""Likelihood penalty of the search at one standard deviation of the odometry. Along a corridor, far points fall between
+the earlier ones, so a scan that moves on loses this much against one that stays."""
 PRIOR_FACTOR = 2.0
-"""Factor on the odometry's errors in the last step, against the search: walls know better where there are any."""
+"""Factor on the odometry's errors in refinement, relative to the search: walls, if any, are more accurate."""
 SEARCH_POINTS = 100
-"""Points that the search looks at, about: it need only come near."""
+"""Approximate number of points for the search, which need only get close."""
 MIN_HITS = 10
-"""Hits below which a scan is not matched: its pose is the odometry's."""
+"""Hits below which a scan is not matched: it takes the odometry's pose."""
 MIN_NEAR_POINTS = 3
-"""Points of the map that a scan's point needs near it: along a corridor lone far ones lie where beams do, and hold
-every scan where the first was."""
+"""Map points needed near a scan point: along a corridor, isolated far points repeat with the beams and would hold every
+scan in place."""
 LOST_SHARE, FOUND_SHARE = 0.5, 0.6
-"""Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
+"""Share of a scan's points on the map below which a match is rejected, and above which a wide search's is accepted."""
 MIN_BACK = 0.05
-"""Metres of a step from which on it is also tried straight back."""
+"""Metres of a step above which the reverse direction is also tried."""
 BACK_MARGIN, BACK_MARGIN_SEEN = 0.05, 0.15
-"""Share of a scan's points by which it must fit better straight back: points on walls alone, and less the share of
-walls seen through."""
+"""Share of a scan's points by which it must fit better in reverse: points on walls alone, and minus the share of walls
+seen through."""
 MIN_LOST_STEP, MAX_LOST_PATH = 0.05, 0.5
-"""Metres that a lost scan counts at least, and metres lost after which the map goes on where the odometry leads."""
+"""Least metres a lost scan counts, and metres lost after which the map continues by odometry."""
 MAX_WIDE_WINDOW = 3.0
-"""Metres of the wide search each way at most."""
+"""Largest half width in metres of the wide search."""
 FIT_SIGMAS = (0.05, 0.03)
-"""Metres and radians (standard deviations) from a place within which its fit is measured."""
+"""Metres and radians (standard deviations) around a pose within which its fit is measured."""
 
 
 class Follower:
-    """Gives each scan its pose, and picks keyframes.
+    """Finds each scan's pose, and picks keyframes.
 
-    keyframes: those so far; their poses may be changed from outside, then call `moved`.
+    keyframes: all so far; after changing their poses from outside, call `moved`.
     pose: (3,) pose_map_base of the last scan.
     """
 
@@ -86,7 +86,7 @@ class Follower:
         return True
 
     def moved(self, keyframe_before: se2.Pose) -> None:
-        """Continue from the last keyframe's new pose; it was at `keyframe_before` (3,)."""
+        """Continue from the last keyframe's new pose; the old one was `keyframe_before` (3,)."""
         self.pose = se2.compose(self.keyframes[-1].pose, se2.relative(keyframe_before, self.pose))
         self._moved.clear()
         self._rebuild()
@@ -99,7 +99,7 @@ class Follower:
         self._held, self._was_lost, self._blind = 0.0, self._lost, 0.0
 
     def _found(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
-        """Return the pose of a scan: as matched, or found by a wide search, or else by the odometry, with slack."""
+        """Return a scan's pose: by matching, else by a wide search, else by the odometry, with slack."""
         self._backed = False
         if len(cloud.points) < MIN_HITS or not self.keyframes:
             return guess
@@ -120,10 +120,10 @@ class Follower:
         return guess
 
     def _forth_or_back(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
-        """Match near the odometry's `guess`; or straight back, where wheels turned the wrong way or a robot was pushed.
+        """Match near the odometry's `guess`; or in reverse, in case wheels turned the wrong way or a robot was pushed.
 
-        Straight back must fit far better, by points on walls and by walls seen through: what lies ahead is new, and
-        every scan seems to fit better a step behind.
+        Reverse must fit far better, by points on walls and by walls seen through: the area ahead is new, so every scan
+        seems to fit better a step behind.
         """
         match, metres = self._matched(cloud, guess, step), float(np.hypot(step[0], step[1]))
         if metres < MIN_BACK or match.share > 1 - BACK_MARGIN:
@@ -135,7 +135,7 @@ class Follower:
         return back if self._backed else match
 
     def _compare(self, cloud: Cloud, odometry: se2.Pose, before: se2.Pose, step: se2.Pose) -> None:
-        """Compare the motion just matched from `before` (3,), with the odometry's."""
+        """Compare the motion just matched, from `before` (3,), with the odometry's."""
         if len(cloud.points) < MIN_HITS:
             metres, radians = self._check.drift(step)
             self._blind += max(metres, radians / SLACK_TURN)
@@ -148,7 +148,7 @@ class Follower:
             self._judge(cloud, since)
 
     def _judge(self, cloud: Cloud, since: Moment) -> None:
-        """Believe matching or odometry since a moment, from when on they contradict each other."""
+        """Choose matching or odometry since the moment at which they began to contradict each other."""
         guess = self._check.by_odometry(since, self.pose)
         (pose, matched), (other, driven) = self._fit(cloud, self.pose), self._fit(cloud, guess)
         if _nearer(other, pose, guess) or matched > driven + self._check.margin:
@@ -189,8 +189,8 @@ class Follower:
         return bool(far)
 
     def _rebuild(self) -> None:
-        """Make the map of the last keyframes; clouds that are in the map's frame stay so until poses change."""
-        known = self._moved  # by the keyframe's number: where the robot turns back, old ones come within reach again
+        """Build the map of the last keyframes; clouds in the map's frame are reused until poses change."""
+        known = self._moved  # by keyframe index: if the robot turns back, old ones are in range again
         self._moved = {i: known[i] if i in known else self._in_map(self.keyframes[i]) for i in self._recent()}
         self._map.build(joined(list(self._moved.values())), self._start[:2])
 
@@ -198,7 +198,7 @@ class Follower:
         return keyframe.cloud.moved(keyframe.pose - self._start)
 
     def _recent(self) -> range:
-        """The last keyframes, back to where the robot was out of sight: where odometry jumps, all starts anew."""
+        """The last keyframes, back to where the view no longer overlaps; if odometry jumps, all starts anew."""
         here, count = self.keyframes[-1].pose, len(self.keyframes)
         first = max(count - self._config.local_keyframes, 0)
         far = [np.hypot(*(k.pose - here)[:2]) > self._config.max_range for k in self.keyframes[first:]]
@@ -206,18 +206,18 @@ class Follower:
 
 
 def odometry_sigmas(config: SlamConfig, step: se2.Pose) -> tuple[float, float]:
-    """Return by how many metres and radians (standard deviations) a step (3,) of the odometry may be off."""
+    """Return the standard deviations, in metres and radians, of an odometry step (3,)."""
     base, per_metre, base_turn, per_radian = config.odometry
     return base + per_metre * float(np.hypot(step[0], step[1])), base_turn + per_radian * abs(float(step[2]))
 
 
 def _agree(pose: se2.Pose, guess: se2.Pose, sigmas: tuple[float, float]) -> bool:
-    """Return whether a match is where the odometry leads: then a scan that finds few walls looks at new ones."""
+    """Return whether a match agrees with the odometry: then a scan that fits few walls is seeing new ones."""
     left = se2.relative(guess, pose)
     return float(np.hypot(left[0], left[1])) < sigmas[0] and abs(float(left[2])) < sigmas[1]
 
 
 def _nearer(pose: se2.Pose, one: se2.Pose, other: se2.Pose) -> bool:
-    """Return whether a pose is nearer to one than to the other, a radian counting as a metre."""
+    """Return whether a pose is nearer to one than to the other, with a radian as a metre."""
     a, b = (se2.relative(pose, goal) for goal in (one, other))
     return float(np.linalg.norm(a)) < float(np.linalg.norm(b))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of where keyframes stand to each other, for the pose graph: steps, and the last refinement."""
+"""Relative poses of keyframes for the pose graph: steps, and the last refinement."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from stereovox.localize.slam.line_map import Cloud, LineMap, joined
 STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
 """Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""
 SLACK_TURN = 0.3
-"""Radians for each metre of slack."""
+"""Radians per metre of slack."""
 PATCH = 4
-"""Keyframes before and after a patch's middle that belong to it: few enough to be rigid."""
+"""Keyframes of a patch before and after its middle: few enough to be rigid."""
 STRIDE = 3
 """Keyframes from one patch's middle to the next."""
 WEAK = 0.1
-"""Share of information below which a direction is a corridor's."""
+"""Share of information below which a direction is unconstrained, as along a corridor."""
 MAX_NEIGHBOURS = 120
-"""Keyframes that are laid onto a patch: a robot may pass the same place all day."""
+"""Most keyframes registered to a patch: a robot may pass the same place all day."""
 MIN_SHARE = 0.4
 """Share of a keyframe's points that must lie on a patch's lines."""
 
 
 @dataclass(eq=False)
 class Keyframe:
-    """A scan that the map is made of.
+    """A scan that the map is built from.
 
-    pose: (3,) pose_map_base as now believed. step: (3,) where it stood as seen from the keyframe before, as matched.
-    cloud: its points in the robot's frame. travelled: metres of the robot's way until here.
-    slack: metres by which `step` may be off beyond what is usual. lost: whether that is because the odometry alone led
-    here, as scans saw nothing, or nothing known; else matching and odometry contradicted each other.
+    pose: (3,) current pose_map_base. step: (3,) pose relative to the previous keyframe, as matched. cloud: its points
+    in the robot's frame. travelled: metres of the robot's path so far. slack: metres by which `step` may be off beyond
+    the usual. lost: whether that is because odometry alone led here, as scans saw nothing, or nothing known; else
+    matching and odometry contradicted each other.
     """
 
     pose: se2.Pose
@@ -51,7 +51,7 @@ class Keyframe:
 
 
 def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
-    """Return what matching scan after scan says: one edge between each keyframe and the next."""
+    """Return the edges from scan-to-scan matching: one between each keyframe and the next."""
     edges = []
     for i, keyframe in enumerate(keyframes[1:]):
         way, turn = float(np.hypot(*keyframe.step[:2])), abs(float(keyframe.step[2]))
@@ -62,21 +62,21 @@ def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
 
 
 def in_map(keyframe: Keyframe) -> Scan:
-    """Return a keyframe's scan with its pose in the map, whatever its stamp says."""
+    """Return a keyframe's scan with its pose in the map, regardless of its stamp."""
     T_map_odom = se2.lifted(se2.compose(keyframe.pose, se2.inverse(keyframe.scan.pose_world_base)))
     return replace(keyframe.scan, T_world_sensor=T_map_odom @ keyframe.scan.T_world_sensor)
 
 
 def in_second_frame(information: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
-    """Return information (3, 3) about x, y, yaw of a frame's place as that about its own x, y, yaw."""
+    """Return information (3, 3) about a frame's x, y, yaw, expressed along that frame's own axes."""
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     return turn.T @ information @ turn
 
 
 def without_weak(information: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
-    """Return information (3, 3) without what it says of the direction in which it says little.
+    """Return information (3, 3) without its weak direction.
 
-    Along a corridor nothing but noise tells where one is, and its pull is towards "has not moved".
+    Along a corridor only noise constrains the position, and it pulls towards "has not moved".
     floor: share of the strongest direction's information below which a direction is dropped.
     """
     values, vectors = np.linalg.eigh(information[:2, :2])
@@ -88,10 +88,10 @@ def without_weak(information: NDArray[np.float64], floor: float) -> NDArray[np.f
 
 
 def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]:
-    """Yield what each keyframe says of where it stands to each patch of other keyframes nearby.
+    """Yield edges from each keyframe to each patch of other keyframes nearby.
 
-    A patch is a short run of keyframes, taken as rigid; edges go from its middle to the keyframe. They start from the
-    keyframes' present poses, so these must be right to a decimetre or two.
+    A patch is a short run of keyframes, taken as rigid; edges go from its middle to the keyframe. Registration starts
+    from the current poses, so these must be right to a decimetre or two.
     """
     places = np.array([keyframe.pose for keyframe in keyframes])
     patch = LineMap(config.voxel_size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of short lines out of the points of scans, and the pose at which another scan lies on it."""
+"""A map of short lines from the points of scans, and registration of scans to it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from stereovox.geometry import se2
 from stereovox.localize.slam import _lines, _match
 
 NEAR = 0.15
-"""Metres on each side of a cell whose points a line is laid through."""
+"""Metres around a cell whose points a line is fitted to."""
 POINT_WEIGHT = 0.3
-"""What a point at a corner counts, compared with one on a line: the nearest point there is a guess."""
+"""Weight of a point at a corner, relative to one on a line: its nearest point is a guess."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """What one scan saw, in the robot's frame.
+    """The points of one scan, in the robot's frame.
 
     points: (N, 2) float32 metres. views: (N, 2) float32, from each point towards the sensor, length 1.
     """
@@ -29,7 +29,7 @@ class Cloud:
     views: NDArray[np.float32]
 
     def moved(self, pose: ArrayLike) -> Cloud:
-        """Return the cloud as seen from where `pose` (3,) is given."""
+        """Return the cloud in the frame in which `pose` (3,) is given."""
         x, y, yaw = np.asarray(pose, float)
         turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
         points = self.points @ turn + (x, y)
@@ -48,17 +48,17 @@ def cloud_of(scan: Scan, max_range: float) -> Cloud:
 
 
 def joined(clouds: list[Cloud]) -> Cloud:
-    """Return several clouds of one frame as one."""
+    """Return several clouds of one frame, joined."""
     return Cloud(np.concatenate([c.points for c in clouds]), np.concatenate([c.views for c in clouds]))
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Where a scan lies on a map.
+    """The registration of a scan to a map.
 
     pose: (3,) x, y, yaw. information: (3, 3) of the scan alone (in the map's frame), in units of 1/m^2 and 1/rad^2 for
     distances with a standard deviation of `sigma`. share: of the scan's points within `sigma` of a line of the map.
-    rms: metres, weighted, of the points to their lines.
+    rms: weighted distance in metres of the points from their lines.
     """
 
     pose: se2.Pose
@@ -68,10 +68,10 @@ class Match:
 
 
 class LineMap:
-    """Points of many scans as lines in a grid of `cell` metres; made anew by `build`, the memory is kept.
+    """Points of many scans as lines in a grid of `cell` metres; rebuilt by `build`, which reuses the memory.
 
     reach: metres from the points within which lines attract. sigma: metres of the likelihood field. fewest: points of a
-    neighbourhood from which on scans are laid onto it.
+    neighbourhood below which scans are not matched to it.
     """
 
     def __init__(self, cell: float, reach: float = 0.25, sigma: float = 0.08, fewest: int = 1):
@@ -87,7 +87,7 @@ class LineMap:
         self.lines = np.empty((0, 8), np.float32)
 
     def build(self, cloud: Cloud, shift: ArrayLike = (0.0, 0.0)) -> LineMap:
-        """Make the map of a cloud, whose points stand `shift` metres from the map's frame. Return it."""
+        """Build the map from a cloud, whose frame is `shift` metres from the map's. Return it."""
         _lines.wipe(self.cells, self._reach, self.index, self.near, self.score)
         points = cloud.points
         margin = (self._reach + 2) * self.cell
@@ -108,7 +108,7 @@ class LineMap:
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Rows and columns that the map of now takes up; there is room for more."""
+        """Rows and columns in use; more may be allocated."""
         return self._extent
 
     def _resize(self, rows: int, columns: int) -> None:
@@ -129,7 +129,7 @@ class LineMap:
         slope: float,
         slope_yaw: float,
     ) -> tuple[se2.Pose, float]:
-        """Return the likeliest pose in a window round a guess, and its likelihood (see `_match.search`)."""
+        """Return the likeliest pose in a window around a guess, and its likelihood (see `_match.search`)."""
         start, best = self._local(guess), np.empty(3)
         cells, turns = int(np.ceil(side / self.cell)), int(np.ceil(side_yaw / step_yaw))
         top = _match.search(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure: finds revisited places, and accepts them only where two findings agree."""
+"""Loop closure: finds revisited places, and accepts them only if two findings agree."""
 
 from __future__ import annotations
 
@@ -16,36 +16,35 @@ from stereovox.localize.slam.graph import Keyframe, in_second_frame
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, joined
 
 COARSE = 2
-"""Cells of the map on the side of one cell of the search."""
+"""Map cells per side of a search cell."""
 SEEDS = 400
-"""Points of a submap that the search looks at."""
+"""Points of a submap used by the search."""
 LEVELS = 6
 """Levels of the search's pyramid: its coarsest cells are 2^5 of the finest across."""
 RIVAL = 0.6
-"""Metres from the best place, within which a good score is the same place's."""
+"""Metres around the best place within which a good score is the same place."""
 MAX_APART = 4.0
-"""Metres by which two submaps' middles may be apart and still show the same walls, beyond what drift explains."""
+"""Largest distance in metres, beyond drift, between the middles of two submaps that show the same walls."""
 NEAR_RANGE, FAR_RANGE = 10.0, 20.0
-"""Metres from the robot up to which points of the later, and of the earlier submap are used: what is near is seen from
-both."""
+"""Range in metres of the points used from the later, and from the earlier submap: near surfaces are seen from both."""
 BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
-"""Metres and radians that are searched even where no drift is to be feared."""
+"""Search window in metres and radians without drift."""
 CORRIDOR = 0.03
 """Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
 MAX_TRIED = 16
-"""Earlier submaps that a new one is laid onto, the nearest: a robot may pass the same place all day."""
+"""Most earlier submaps a new one is matched to, the nearest: a robot may pass the same place all day."""
 WITNESS_PATH = 15.0
-"""Metres of way within which two findings can bear each other out."""
+"""Metres of path within which two findings can confirm each other."""
 WITNESS = (0.1, 0.02, 0.02)
-"""How far they may disagree: metres, metres per metre of way, radians."""
+"""How far they may disagree: metres, metres per metre of path, radians."""
 SHORT_CUT = 1e-3
-"""Metres along which drift adds up over a closure: none, but a graph has no edges of length 0."""
+"""Metres of drift path over a closure: nearly 0, because the graph has no edges of length 0."""
 
 
 class LoopFinder:
-    """Keeps the submaps so far, and finds edges between those that show the same place.
+    """Keeps the submaps so far, and finds edges between submaps that show the same place.
 
-    edges: closures believed. candidates: all that were found.
+    edges: accepted closures. candidates: all closures found.
     """
 
     def __init__(self, config: SlamConfig, keyframes: list[Keyframe]):
@@ -56,7 +55,7 @@ class LoopFinder:
         self._submaps: list[Submap] = []
 
     def update(self, end: bool = False) -> list[Edge]:
-        """Search for the places of submaps that are complete since the last call; return the edges now believed too."""
+        """Match the submaps completed since the last call; return the newly accepted edges."""
         before, size = len(self.edges), self._config.submap_keyframes
         while True:
             first = len(self._submaps) * max(size // 2, 1)
@@ -93,7 +92,7 @@ class LoopFinder:
         self._judge(Edge(first, second, match.pose, information))
 
     def _judge(self, found: Edge) -> None:
-        """Accept a finding, and those it confirms, once another one agrees with it."""
+        """Accept a finding, and the ones it confirms, once another agrees with it."""
         witnesses = [other for other in self.candidates if self._agree(found, other)]
         self.candidates.append(found)
         if witnesses:
@@ -112,7 +111,7 @@ class LoopFinder:
         return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * path_m and abs(left[2]) < WITNESS[2])
 
     def _window(self, earlier: Submap, later: Submap, path_m: float) -> tuple[float, float] | None:
-        """Metres and radians to search for the later submap, None if it cannot show the same place."""
+        """Search window in metres and radians for the later submap, None if it cannot show the same place."""
         config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
         if b.travelled - a.travelled < config.closure_path:
             return None
@@ -130,7 +129,7 @@ class LoopFinder:
         number = {anchor: i for i, anchor in enumerate(anchors)}
         along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
         steps = {(i, i + 1): max(float(path_m), SHORT_CUT) for i, path_m in enumerate(np.diff(along))}
-        # One length for each pair: a matrix made of several adds them up.
+        # one length per pair: building the matrix would sum duplicates
         lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
         rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
         graph = coo_matrix((list(lengths.values()), (rows, columns)), shape=(len(anchors), len(anchors)))
@@ -138,7 +137,7 @@ class LoopFinder:
 
 
 class ClosureSearch:
-    """Searches the place of clouds on the map of an earlier cloud."""
+    """Finds the pose of clouds on the map of an earlier cloud."""
 
     def __init__(self, config: SlamConfig):
         self._config = config
@@ -172,7 +171,7 @@ class ClosureSearch:
         return match
 
     def place(self, seeds: NDArray[np.float32], guess: se2.Pose, side: float, side_yaw: float) -> se2.Pose | None:
-        """Return the pose with the best score, None if it is below `closure_score` or has a rival."""
+        """Return the pose with the best score, None if the score is below `closure_score` or has a rival."""
         cell, config = self._coarse.cell, self._config
         step = cell / max(float(np.sqrt((seeds**2).sum(axis=1).max())), 1.0)
         turns = int(np.ceil(side_yaw / step))
@@ -202,14 +201,14 @@ class Submap:
 
     @property
     def anchor(self) -> int:
-        """The keyframe in its middle, whose frame is the submap's."""
+        """The middle keyframe, whose frame is the submap's."""
         return (self.first + self.last) // 2
 
 
 def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, cell: float = 0.0) -> Cloud:
     """Return the points of a submap within `max_range` of each robot pose, in its anchor's frame.
 
-    cell: side in metres of squares of which each gives one point; 0: all points.
+    cell: side in metres of squares that keep one point each; 0: all points.
     """
     pose = keyframes[submap.anchor].pose
     clouds = []

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether matching and odometry agree, and which of them to believe where they do not.
+"""Whether matching and odometry agree, and which of them to trust if they do not.
 
-One step says little: clocks differ, wheels jolt. So both motions are compared over the last metre, and what is usual is
-learned from the drive itself.
+One step says little: clocks differ, wheels jolt. So both motions are compared over the last metre, and their usual
+difference is learned from the drive itself.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from stereovox.geometry import se2
 from stereovox.localize.slam.line_map import Cloud
 
 COMPARED_PATH, COMPARED_SCANS = 1.0, 20
-"""Metres of odometry, and at most so many scans, over which the two motions are compared."""
+"""Metres of odometry, and most scans, over which the two motions are compared."""
 MIN_LIMIT, MIN_LIMIT_TURN = 0.25, 0.2
-"""Metres and radians: the limits of what they may differ by are never less."""
+"""Lower bounds, in metres and radians, of the limits on their difference."""
 MAX_LIMIT, MAX_LIMIT_TURN = 0.4, 0.35
-"""Metres and radians: the limits are never more, however bad the odometry is."""
+"""Upper bounds of those limits, however bad the odometry is."""
 LIMIT_FACTOR, LEARNING_RATE = 6.0, 0.01
-"""The limits as multiples of the usual difference; the share of a scan's difference that goes into what is usual."""
+"""The limits as multiples of the usual difference; weight of one scan in the usual difference."""
 SLIPPED_SCALE, STUCK_SCALE, SCALED_SCANS = 2.0, 0.25, 10
-"""Factors on the odometry's errors after wheels slipped, and after matching stuck; number of scans that they hold."""
+"""Factors on the odometry's errors after wheels slipped, and after matching stuck; number of scans they last."""
 SHARE_MARGIN, SHARE_MARGIN_SLIPPING = 0.25, 0.05
-"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: usually, and
+"""Share of a scan's points by which the matched pose must fit better than the odometry's to be accepted: usually, and
 while wheels slip."""
 STILL = 1e-3
-"""Metres and radians of a step below which the robot stands."""
+"""Metres and radians of a step below which the robot stands still."""
 MIN_BEHIND = 0.3
-"""Metres behind a wall that a beam must end to contradict it."""
+"""Metres behind a wall at which a beam must end to contradict it."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Where odometry and matching saw the robot at one scan, (3,) each in a frame of its own; metres travelled."""
+    """The robot's pose at one scan by odometry and by matching, (3,) each in its own frame; metres travelled."""
 
     odometry: se2.Pose
     matched: se2.Pose
@@ -47,7 +47,7 @@ class Moment:
 class OdometryCheck:
     """Compares odometry with matching.
 
-    scale: factor on what the odometry may be off by, 1 where both agreed.
+    scale: factor on the odometry's errors, 1 while both agree.
     """
 
     def __init__(self) -> None:
@@ -62,13 +62,13 @@ class OdometryCheck:
 
     @property
     def margin(self) -> float:
-        """The share by which the matched place must fit better."""
+        """The share by which the matched pose must fit better."""
         return SHARE_MARGIN_SLIPPING if self.scale > 1 else SHARE_MARGIN
 
     def add(self, odometry: se2.Pose, before: se2.Pose, after: se2.Pose) -> Moment | None:
         """Take the odometry (3,) at a scan whose match moved the robot from `before` to `after`, (3,) each.
 
-        Return the moment since when both contradict each other, None if they agree.
+        Return the moment since which they contradict each other, None if they agree.
         """
         self._left = max(self._left - 1, 0)
         if not self._past:
@@ -86,26 +86,26 @@ class OdometryCheck:
         return since if (apart > limits).any() else None
 
     def drift(self, step: se2.Pose) -> tuple[float, float]:
-        """Return the metres and radians by which odometry and matching usually come apart over a step (3,)."""
+        """Return the usual difference, in metres and radians, of odometry and matching over a step (3,)."""
         metres, radians = float(np.hypot(step[0], step[1])), abs(float(step[2]))
         moved = metres + radians > STILL
         share = max(metres / COMPARED_PATH, moved / COMPARED_SCANS)
         return share * float(self._usual[0]), share * float(self._usual[1])
 
     def restart(self, odometry: se2.Pose, pose: se2.Pose) -> None:
-        """Compare from here on, after a scan that was not matched: odometry (3,) and the pose (3,) it led to."""
+        """Restart the comparison after an unmatched scan, at the odometry (3,) and the pose (3,) it led to."""
         self._past.clear()
         self._past.append(Moment(odometry, pose, 0.0))
 
     def settle(self, scale: float) -> None:
-        """Compare anew from the last scan on; the odometry's errors are `scale` times as large for a while."""
+        """Restart the comparison at the last scan; the odometry's errors are scaled by `scale` for a while."""
         last = self._past[-1]
         self._past.clear()
         self._past.append(last)
         self._scale, self._left = scale, SCALED_SCANS
 
     def by_odometry(self, since: Moment, pose: se2.Pose) -> se2.Pose:
-        """Return where the robot, matched to `pose` (3,), stands by the odometry since a moment."""
+        """Return the odometry's pose, since a moment, of the robot matched to `pose` (3,)."""
         last = self._past[-1]
         there = se2.compose(pose, se2.relative(last.matched, since.matched))
         return se2.compose(there, se2.relative(since.odometry, last.odometry))
@@ -117,10 +117,10 @@ class OdometryCheck:
 
 
 def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple[int, int]:
-    """Count how many of other points a scan sees through, and how many it could.
+    """Count how many of other points a scan sees through, and how many it could see.
 
-    seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within a
-    degree; it is seen through where that beam ends `MIN_BEHIND` metres or more behind it, on both sides too.
+    seen: the scan, in the robot's frame; points: (N, 2) there. A point counts if the scan has a beam within a degree;
+    it is seen through if that beam and those on both sides of it end `MIN_BEHIND` metres or more behind the point.
     """
 
     def polar(p: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simultaneous localisation and mapping from a 2-D lidar: what gmapping does in IST 2019, by matching and a pose graph.
+"""Simultaneous localisation and mapping from a 2-D lidar: the role of gmapping in IST 2019, by matching and a pose
+graph.
 
-Each scan is laid onto the lines of the last keyframes (correlative search as Olson 2009, then point to line). Submaps
-are laid onto earlier ones by branch and bound (Hess et al. 2016); closures that agree enter a pose graph (gtsam). At
-the end all keyframes are matched with all others that saw the same walls.
+Each scan is registered to the lines of the last keyframes (correlative search as Olson 2009, then point to line).
+Submaps are registered to earlier ones by branch and bound (Hess et al. 2016); closures that agree enter a pose graph
+(gtsam). At the end all keyframes are matched with all others that saw the same walls.
 """
 
 from __future__ import annotations
@@ -31,22 +32,22 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 
 MIN_LATE_SCANS = 3
-"""Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
+"""Consecutive late scans, in order among themselves, before deciding which stamps are wrong."""
 Progress = Callable[[int, int, str], object]
 CLOSURE_WEIGHT, PATCH_WEIGHT = 0.02, 0.1
-"""Factors on a match's information: its points are not independent, nor is what they lie on exact."""
+"""Factors on a match's information: its points are not independent, nor is the map exact."""
 SCANS_PER_KEYFRAME = 2.25
-"""Scans that a keyframe counts as in the map: it stands for those around it, and one is enough to know a cell."""
+"""Scans that a keyframe counts as in the map: it represents its neighbours, and one suffices to know a cell."""
 MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
 MIN_JUMP, MIN_JUMP_TURN = 0.05, 0.01
-"""Metres and radians that a closure must be off for the graph to be solved anew on the way."""
+"""Metres and radians by which a closure must be off for the graph to be solved again online."""
 
 
 def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
-    """Return the track and the map of scans in time order, whose poses are those of the odometry.
+    """Return the track and the map of scans in time order, whose poses are the odometry's.
 
-    progress: called with how many are done, how many there are (0: unknown) and the current activity.
+    progress: called with scans done, scans in all (0: unknown) and the current activity.
     """
     slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
     for done, scan in enumerate(scans, 1):
@@ -59,8 +60,8 @@ def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None =
 class Slam:
     """SLAM over scans in time order, with the odometry as pose; the map's frame is the odometry's at the first scan.
 
-    refused: refused scans by reason; they change nothing. `not_in_order`: those not later than the one before, and
-    those whose stamp most later scans show to be wrong; the latter are only left out of the track.
+    refused: refused scans by reason; they change nothing. `not_in_order`: scans not later than the one before, and
+    scans whose stamp most later ones prove wrong; the latter are only left out of the track.
     """
 
     def __init__(self, config: Config):
@@ -73,21 +74,21 @@ class Slam:
         self._map = KeyframeMap(config)
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map as known so far; None before the first keyframe. Later loops may change all of it."""
+        """Return the map so far; None before the first keyframe. Later loops may change all of it."""
         return self._map.grid(self.keyframes) if self.keyframes else None
 
     @property
     def pose(self) -> se2.Pose:
-        """Where the robot stood at the last scan, (3,) pose_map_base."""
+        """The robot's pose at the last scan, (3,) pose_map_base."""
         return self._follower.pose
 
     @property
     def keyframes(self) -> list[Keyframe]:
-        """The scans that the map is made of, with their poses as now believed."""
+        """The scans that the map is built from, with their current poses."""
         return self._follower.keyframes
 
     def add(self, scan: Scan) -> se2.Pose:
-        """Process the next scan; return (3,) pose_map_base as known so far. Later loops may move it."""
+        """Process the next scan; return its current (3,) pose_map_base. Later loops may move it."""
         try:
             scan = checked_scan(scan, self._config)
         except FrameRefused as refused:
@@ -146,7 +147,7 @@ class Slam:
 
 
 class KeyframeMap:
-    """The floor map of keyframes. New ones are added to it; it is made anew once earlier ones have moved."""
+    """The floor map of keyframes. New ones are added to it; it is rebuilt once earlier ones have moved."""
 
     def __init__(self, config: Config):
         self._settings = config.slam
@@ -157,7 +158,7 @@ class KeyframeMap:
         self._map, self._drawn = GridMap(self._config), np.empty((0, 3))
 
     def grid(self, keyframes: list[Keyframe]) -> OccupancyGrid:
-        """Return the map of all keyframes at their poses as of now. Raises StereovoxError if it is too wide."""
+        """Return the map of all keyframes at their current poses. Raises StereovoxError if it is too wide."""
         poses, drawn = np.array([keyframe.pose for keyframe in keyframes]), len(self._drawn)
         _check_extent(poses, self._settings.voxel_size)
         if not np.array_equal(poses[:drawn], self._drawn):
@@ -172,11 +173,12 @@ class KeyframeMap:
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """A robot's track, and the map of what it saw.
+    """A robot's track and its map.
 
     track: the pose of every scan that was not refused. grid: the map, built from the keyframes. keyframes: with their
-    final poses. closures: number of loops closed. edges: those, between keyframes. refused: refused scans by reason.
-    doubts: what the scans say against the map; empty if the self-check found nothing.
+    final poses. closures: number of loops closed. edges: these loops, between keyframes. refused: refused scans by
+    reason.
+    doubts: objections of the scans to the map; empty if the self-check found nothing.
     """
 
     track: Track
@@ -188,13 +190,13 @@ class SlamResult:
 
     @property
     def closures(self) -> int:
-        """How many pairs of submaps were found to show one place."""
+        """Number of pairs of submaps found to show one place."""
         return len(self.edges)
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A scan: where the odometry saw the robot (3,), and where it stood (3,) as seen from keyframe `keyframe`."""
+    """A scan: the robot's pose by odometry (3,), and its pose (3,) relative to keyframe `keyframe`."""
 
     stamp_ns: int
     odometry: se2.Pose
@@ -214,7 +216,7 @@ class TrackBuilder:
         """Make room for a scan at `stamp_ns`; return how many earlier ones were dropped, None if it is itself too
         late.
 
-        A single stamp in the future would make all later scans late. So once more scans in a row are late than there
+        A single stamp in the future would make all later scans late. So if more consecutive scans are late than there
         were steps after the first of them, those steps have the wrong stamps and are dropped.
         """
         ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
@@ -231,7 +233,7 @@ class TrackBuilder:
         return ahead
 
     def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
-        """Append a scan that there is room for, and the pose (3,) of the robot.
+        """Append a scan accepted by `room`, and the pose (3,) of the robot.
 
         Steps before the first keyframe are stored relative to it.
         """
@@ -250,7 +252,7 @@ class TrackBuilder:
 
 
 def _repeated(p: float) -> float:
-    """Return the probability that a keyframe gives a cell to which a scan gives `p`."""
+    """Return the probability a keyframe gives a cell for which one scan gives `p`."""
     odds = (p / (1 - p)) ** SCANS_PER_KEYFRAME
     return odds / (1 + odds)
 

@@ -18,10 +18,10 @@ Heights = tuple[float, float]
 
 
 def floor_axes(up: str) -> tuple[int, int, int, int]:
-    """Return the map axes that are x and y of its floor, the axis across the floor, and the sign of the latter along
+    """Return the map axes that are x and y of its floor, the axis normal to the floor, and the sign of the latter along
     `up`.
 
-    x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z for x, z
+    x and y are the map's if z is up; else the two axes that make a right-handed frame with `up`: y and z for x, z
     and x for y, and with a minus the same two swapped.
     """
     upright = "xyz".index(up[-1])
@@ -32,7 +32,7 @@ def floor_axes(up: str) -> tuple[int, int, int, int]:
 def upright_axes(up: str) -> NDArray[np.float64]:
     """Return rows (3, 3) x, y and z of a right-handed frame whose z is a map's `up`, as directions in the map's frame.
 
-    They are the axes of the grid that `projection.project` makes.
+    These are the axes of the grid from `projection.project`.
     """
     x, y, upright, sign = floor_axes(up)
     unit = np.eye(3)
@@ -75,7 +75,7 @@ def checked_band(heights: Heights) -> Heights:
 
 
 def check_level(config: Config) -> None:
-    """Raise StereovoxError if the layers of a map are so far from level that they show no floor."""
+    """Raise StereovoxError if the layers of a map are too far from level to show a floor."""
     if config.tilt > MAX_TILT:
         tilt = f"{np.degrees(config.tilt):.0f} degrees off {config.up}"
         raise StereovoxError(f"up is {tilt}, so no layer of the map is level; map the recording again with --level")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The height of the floor at each place of a map, or that it is unknown: what all 2-D products measure heights from.
+"""The height of the floor at each place of a map, or unknown: the reference for heights in all 2-D products.
 
-A map's world may begin anywhere: z = 0 of a tracked map is where the camera began. So heights that matter to a robot
-are never measured from the world's origin, unless a user states that the floor lies at a certain height there.
+A map's world may begin anywhere: z = 0 of a tracked map is where the camera began. So robot heights are never
+measured from the world's origin, unless a user states the height of the floor there.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from stereovox.products.floor.floor_search import FloorSearch
 from stereovox.products.floor.ground_surfaces import NO_SURFACE, floor_of, place_of
 
 REACH = 0.5
-"""Metres from the nearest floor that was seen, within which its height holds."""
+"""Metres from the nearest observed floor within which its height applies."""
 NO_FLOOR = "the map shows no floor, so heights above it are unknown and nothing is free"
 CURE = "let the camera see the floor, or state its height in the world: --set scan.floor=Z (export: --floor Z), metres"
 TIE = 1e-4
-"""Cells: lengths that are so near to whole cells are."""
+"""Rounding tolerance in cells."""
 SMOOTHED = 5
-"""Cells along the sides of the square of which a floor's height is the median: one noisy cell does not lift it."""
+"""Side in cells of the square whose median is a floor's height: one noisy cell does not lift it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +35,14 @@ class FloorHeights:
     """The height of the floor at each place of a map, seen from above; row 0 and column 0 are the lowest.
 
     Attributes:
-        height: (rows, columns) float32, metres along the map's `up` from the world's origin: of the nearest floor that
-            was seen. NaN if there is none at all.
-        away: (rows, columns) float32, horizontal metres to that floor; 0 where it was seen itself, infinite where free
-            space lies deeper, as beyond the edge of a drop.
+        height: (rows, columns) float32, metres along the map's `up` from the world's origin, of the nearest observed
+            floor. NaN if there is none at all.
+        away: (rows, columns) float32, horizontal metres to that floor; 0 if observed here, infinite if free space lies
+            deeper, as beyond the edge of a drop.
         resolution: Side of a cell in metres.
         origin: x, y, yaw of the corner of cell (0, 0), in the axes of `projection.project`.
         up: The axis of the map that points up.
-        elsewhere: Height in metres of a floor that is stated to be level everywhere; NaN for one that was found.
+        elsewhere: Height in metres of a floor stated to be level everywhere; NaN if the floor was found.
     """
 
     height: NDArray[np.float32]
@@ -54,7 +54,7 @@ class FloorHeights:
 
     @classmethod
     def level(cls, height: float, up: str = "z") -> FloorHeights:
-        """Return a floor that is level everywhere, because the user states so.
+        """Return a floor that the user states to be level everywhere.
 
         Args:
             height: Metres along `up` from the world's origin.
@@ -70,7 +70,7 @@ class FloorHeights:
 
     @classmethod
     def unknown(cls, up: str = "z") -> FloorHeights:
-        """Return a floor whose height is known nowhere."""
+        """Return a floor of unknown height everywhere."""
         nothing = np.empty((0, 0), np.float32)
         return cls(nothing, nothing, 1.0, (0.0, 0.0, 0.0), up)
 
@@ -80,11 +80,11 @@ class FloorHeights:
         return bool(np.isfinite(self.elsewhere) or np.isfinite(self.height).any())
 
     def at(self, points: ArrayLike, reach: float = REACH) -> NDArray[np.float64]:
-        """Return the height of the floor below or above places.
+        """Return the height of the floor below or above points.
 
         Args:
             points: (N, 3) metres, world frame.
-            reach: Metres to the nearest floor that was seen within which its height holds.
+            reach: Metres from the nearest observed floor within which its height applies.
 
         Returns:
             (N,) metres along `up` from the world's origin; NaN if the floor is unknown there.
@@ -98,18 +98,18 @@ class FloorHeights:
     def layers(
         self, low: NDArray[np.int64], high: NDArray[np.int64], config: Config, heights: Heights
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-        """Return which layers of a map's cells lie within heights above the floor.
+        """Return the layers of a map's cells within a range of heights above the floor.
 
         Args:
             low: (2,) first column and row, in cells of the map.
             high: (2,) column and row after the last.
             config: Settings of the map.
-            heights: Lowest and highest metres above the floor. A cell of which any part lies between them counts, but
-                never the cell that the floor itself lies in.
+            heights: Lowest and highest metres above the floor. A cell that overlaps this range counts, but never the
+                cell that contains the floor itself.
 
         Returns:
-            First and last layer (rows, columns) int32 along the map's axis, the first above the last where no floor is
-            known; and whether the floor was seen within REACH (rows, columns).
+            First and last layer (rows, columns) int32 along the map's axis, the first above the last if no floor is
+            known; and whether a floor was observed within REACH (rows, columns).
         """
         _, _, up, sign = floor_axes(self.up)
         side = config.cell[up]
@@ -124,8 +124,8 @@ class FloorHeights:
         return np.where(known, lowest, limits[1]).astype(np.int32), top, known & (away <= REACH)
 
     def moved_from(self, before: FloorHeights) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-        """Return first column and row, and those after the last, in cells of the map, between which the floor is no
-        longer as it was; None if nothing moved."""
+        """Return the first column and row, and the ones after the last, in cells of the map, of the region where the
+        floor changed; None if nothing changed."""
         boxes = [one._box() for one in (self, before) if one.height.size]
         if not boxes:
             return None
@@ -139,7 +139,7 @@ class FloorHeights:
         return low + np.array([columns[0], rows[0]]), low + np.array([columns[-1], rows[-1]]) + 1
 
     def _box(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return first column and row of the picture in cells of the map, and those after the last."""
+        """Return first column and row of the picture in cells of the map, and the ones after the last."""
         first = np.rint(np.array(self.origin[:2]) / self.resolution).astype(np.int64)
         return first, first + self.height.shape[::-1]
 
@@ -152,9 +152,9 @@ class FloorHeights:
     def _nearest(
         self, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the height of the nearest floor that was seen, NaN for none, and how far away it is in metres.
+        """Return the height of the nearest observed floor, NaN if none, and its distance in metres.
 
-        rows, columns: of one shape, in cells of this picture; they may lie outside of it.
+        rows, columns: of one shape, in cells of this picture; they may be outside it.
         """
         if not self.height.size:
             return np.full(rows.shape, self.elsewhere), np.zeros(rows.shape)
@@ -166,13 +166,13 @@ class FloorHeights:
 def floor_of_map(
     voxel_map: VoxelMap, stated: FloorHeights | float | None = None, start: ArrayLike | None = None
 ) -> FloorHeights:
-    """Return the floor of a map: the level one that is stated, or that `scan.floor` states, or else what is found.
+    """Return the floor of a map: the level floor that is stated here or in `scan.floor`, or else the one found.
 
     Args:
         voxel_map: The map.
-        stated: Metres along the map's `up` from the world's origin, or a floor that was found before; None:
+        stated: Metres along the map's `up` from the world's origin, or a floor found before; None:
             `scan.floor`.
-        start: See `find_floor`; with it the floor is found.
+        start: See `find_floor`; if given, the floor is searched.
 
     Raises:
         StereovoxError: As `find_floor`.
@@ -196,20 +196,20 @@ def known_floor(
 
 @one_state
 def find_floor(voxel_map: VoxelMap, start: ArrayLike | None = None) -> FloorHeights:
-    """Find the floor of a map: heights per place, so that it may slope, and have steps of up to 0.1 m.
+    """Find the floor of a map: heights per cell, so that it may slope and have steps of up to 0.1 m.
 
     The floor is the lowest large surface near and below the camera of the last frame, with room for 1.8 m above it, and
-    what continues it (`floor_search`). Where it was not seen the nearest floor's height stands, with its distance.
+    its continuation (`floor_search`). Unobserved cells take the nearest floor's height, with its distance.
 
     Args:
         voxel_map: The map.
-        start: (3,) metres, near the floor that counts instead, of several storeys or steps.
+        start: (3,) metres, near the wanted floor, if there are several storeys or steps.
 
     Returns:
-        The floor's height at each place, unknown everywhere if the map shows no floor.
+        The floor's height in each cell, unknown everywhere if the map shows no floor.
 
     Raises:
-        StereovoxError: The map is too large or not level, or `start` is no place.
+        StereovoxError: The map is too large or not level, or `start` is invalid.
     """
     from scipy.ndimage import distance_transform_edt, median_filter
 

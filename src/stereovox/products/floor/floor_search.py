@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the surfaces of a map are its floor: one level per column.
+"""The search for the floor among a map's surfaces: one level per column.
 
 A surface has room for a robot above it and was seen from above. Surfaces grow together from cell to cell; the floor is
-the lowest large group under the camera, and what continues it beyond gaps. Three things are no floor: what rises too
-fast above lower floor nearby (furniture whose noise reads as a stair), what lies under another storey on which the
-camera is, and a surface next to which much free space lies deeper (a table whose floor was not seen).
+the lowest large group under the camera, and its continuation beyond gaps. Three kinds are rejected: surfaces that rise
+too fast above lower floor nearby (furniture whose noise reads as a stair), surfaces under another storey that the
+camera is on, and surfaces with much deeper free space next to them (a table whose floor was not seen).
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ STEP = 0.1
 GROWTH = 0.05
 """Metres by which neighbouring cells of one surface may differ; at least one cell."""
 AREA = 1.0
-"""Square metres from which a surface is large, whatever others there are; only large ones may be a step apart."""
+"""Square metres above which any surface is large; only large ones may be a step apart."""
 LEAST = 0.25
-"""Square metres that a floor has at least."""
+"""Least area of a floor in square metres."""
 STEEPEST = 0.4
 """Steepest floor, rise over run: 22 degrees."""
 RADII = (0.15, 0.25, 0.5, 1.0, 2.0)
-"""Metres within which a floor rises no faster than that, above a step."""
+"""Metres within which that slope is checked, above a step."""
 NEAR = 3.0
-"""Horizontal metres from the camera within which the floor under it is sought first."""
+"""Horizontal metres around the camera in which its floor is searched first."""
 COVERED = 0.5
-"""A floor of which such a part near the camera lies under another floor below the camera is another storey."""
+"""A floor is another storey if this share of it near the camera lies under a higher floor below the camera."""
 DEEP, RIM, HOLLOW = 0.3, 1.0, 0.5
-"""No floor has, within RIM metres, HOLLOW times as many columns as its own with free cells DEEP metres lower."""
+"""A surface is rejected if columns within RIM metres with free cells DEEP metres lower exceed HOLLOW times its own."""
 BESIDE_M, MOST_DEEP = 0.25, 0.3
-"""A small surface is no floor if at more than such a part of it free space lies deeper within so many metres."""
+"""A small surface is rejected if more than this share of it has deeper free space within this many metres."""
 ROUNDS = 4
-"""Most steps of a floor beyond gaps."""
+"""Most extensions of a floor beyond gaps."""
 
 
 class FloorSearch:
@@ -57,7 +57,7 @@ class FloorSearch:
 
     Args:
         floor: The map's columns.
-        start: (3,) row, column and level in cells of a place near the floor that counts; None: the floor is sought.
+        start: (3,) row, column and level in cells of a place near the wanted floor; None: search for it.
         camera: The same of the camera; None: unknown.
     """
 
@@ -77,7 +77,7 @@ class FloorSearch:
         return self._grown(surfaces[kept & ~self._leaks(first)[tuple(surfaces[:, :2].T)]])
 
     def _grown(self, surfaces: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the floor among surfaces (N, 3) row, column, level: the group it begins with, and its islands."""
+        """Return the floor among surfaces (N, 3) row, column, level: the group it starts from, and its islands."""
         group = components(surfaces, [(*way, rise) for way in BESIDE for rise in range(-self._climb, self._climb + 1)])
         first = self._first(surfaces, group)
         if first is None:
@@ -93,7 +93,7 @@ class FloorSearch:
         return levels
 
     def _first(self, surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> int | None:
-        """Return the group that the floor begins with, None if no surface can be one."""
+        """Return the group that the floor starts from, None if no surface qualifies."""
         if not len(surfaces):
             return None
         if self._start is not None:
@@ -110,7 +110,7 @@ class FloorSearch:
         return None
 
     def _stands(self, surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which groups stand above something lower: a box next to a floor that is as high as its top."""
+        """Return which groups are above something lower: a box next to a floor as high as its top."""
         from scipy.ndimage import minimum_filter
 
         window = 2 * max(1, round(BESIDE_M / self._floor.resolution)) + 1
@@ -130,7 +130,7 @@ class FloorSearch:
         return (away <= NEAR) & (surfaces[:, 2] < self._camera[2])
 
     def _is_covered(self, mine: NDArray[np.int64], others: NDArray[np.int64]) -> bool:
-        """Return whether a floor, near the camera, lies mostly under others there."""
+        """Return whether a floor near the camera lies mostly under other surfaces."""
         if not len(mine):
             return False
         top = np.full(self._floor.shape, -NO_SURFACE, np.int64)
@@ -150,12 +150,12 @@ class FloorSearch:
         return bool(np.count_nonzero(hollow) > HOLLOW * np.count_nonzero(levels != NO_SURFACE))
 
     def drops(self, height: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return where free space lies deeper than a step below a floor at levels (rows, columns): it is not there."""
+        """Return the mask of free space deeper than a step below a floor at levels (rows, columns): no floor there."""
         return self._lowest_free < height - 1 - self._step
 
     @cached_property
     def _lowest_free(self) -> NDArray[np.int64]:
-        """The level (rows, columns) of the lowest free cell's bottom; NO_SURFACE if nothing is free."""
+        """Bottom level (rows, columns) of the lowest free cell; NO_SURFACE if nothing is free."""
         floor = self._floor
         free = np.floor(floor.voxel_map.free() / floor.voxel_map.config.cell).astype(np.int64)
         x, y, up = free[:, floor.axes].T
@@ -164,7 +164,7 @@ class FloorSearch:
         return lowest
 
     def _leaks(self, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return where the floor (rows, columns) rises too fast above lower floor nearby."""
+        """Return the mask of floor (rows, columns) that rises too fast above lower floor nearby."""
         from scipy.ndimage import minimum_filter
 
         leaks = np.zeros(levels.shape, bool)

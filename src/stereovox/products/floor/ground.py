@@ -19,9 +19,9 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.products.floor.ground_surfaces import Floor, floor_of, ground_levels
 
 MIN_REACH = 2
-"""Fewest cells on each side over which a slope is fitted, since heights are whole cells."""
+"""Fewest cells on each side over which a slope is fitted, because heights are whole cells."""
 MARGIN = 1e-3
-"""Share of a cell by which query boxes keep away from neighbouring cells."""
+"""Share of a cell by which query boxes stay clear of neighbouring cells."""
 PERCENT = np.array([UNKNOWN, 0, 50, 100, 100, 100, 100], np.int8)
 """The occupancy of each `Footing`."""
 
@@ -31,14 +31,14 @@ def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | N
     """Find the ground and where a robot can drive on it.
 
     Ground is occupied, has a free cell above it within a step, and nothing occupied within the robot's height. It grows
-    from a seed surface to all surfaces that differ by no more than a step from one cell to the next; so a table top is
-    no ground, and a ramp is. Ground beyond an unseen gap counts if it begins no more than a step higher or lower. Where
-    floors overlap, the one nearest in height to `start` counts, or else the lower one.
+    from a seed surface to all surfaces that differ by at most a step from one cell to the next; so a table top is no
+    ground, and a ramp is. Ground beyond an unseen gap counts if it begins at most a step higher or lower. If floors
+    overlap, the one nearest in height to `start` counts, or else the lower one.
 
-    A cell is drivable where all room above the step is free, the slope (of the plane that fits best within the robot's
-    radius) is not too steep, and there is no step next to it. Where no ground was seen, something occupied in the
-    robot's height above the nearest ground is an obstacle, a surface more than a step below it a drop; everything else
-    is unknown. The footprint of the robot is not included: inflate the grid for that.
+    A cell is drivable if all room above the step is free, the slope (of the plane that fits best within the robot's
+    radius) is not too steep, and no step is next to it. Where no ground was seen, an occupied cell within the robot's
+    height above the nearest ground is an obstacle, and a surface more than a step below it a drop; all else is unknown.
+    The robot's footprint is not included: inflate the grid for that.
 
     Args:
         voxel_map: The map.
@@ -66,7 +66,7 @@ class Ground:
     """The ground seen from above; row 0 and column 0 are the lowest.
 
     Attributes:
-        height: (rows, columns) float32, metres along the map's `up`, of the upper face of the ground; NaN where none
+        height: (rows, columns) float32, metres along the map's `up`, of the upper face of the ground; NaN if none
             was seen.
         footing: (rows, columns) uint8 `Footing`.
         resolution: Side of a cell in metres.
@@ -114,11 +114,11 @@ class Footing(IntEnum):
 
     UNKNOWN = 0
     DRIVABLE = 1
-    TENTATIVE = 2  # something above the ground is not decided
+    TENTATIVE = 2  # something above the ground is tentative
     OBSTACLE = 3  # something stands or hangs there
-    STEP = 4  # the ground beside is higher or lower by more than a step
+    STEP = 4  # neighbouring ground is higher or lower by more than a step
     STEEP = 5
-    DROP = 6  # what is there lies lower by more than a step, and no way leads down
+    DROP = 6  # the surface is lower by more than a step, and no path leads down
 
 
 def write_ground(found: Ground, path: str | Path) -> None:
@@ -133,12 +133,12 @@ def write_ground(found: Ground, path: str | Path) -> None:
 def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[np.float64]:
     """Return the slope (rows, columns), rise over run, of the plane that best fits the heights around each cell.
 
-    height: (rows, columns) metres, NaN for none. The square around a cell extends `radius` metres to each side, at
-    least two cells. 0 if there is no height, or where the heights lie on one line of cells.
+    height: (rows, columns) metres, NaN if none. The square around a cell extends `radius` metres to each side, at
+    least two cells. 0 if there is no height, or if the heights lie on one line of cells.
     """
     from scipy.ndimage import correlate1d
 
-    reach = max(int(np.ceil(min(radius / side, max(height.shape)) - 1e-9)), MIN_REACH)  # farther off there is nothing
+    reach = max(int(np.ceil(min(radius / side, max(height.shape)) - 1e-9)), MIN_REACH)  # nothing is farther off
     known = ~np.isnan(height)
     z = np.where(known, height - (height[known].mean() if known.any() else 0), 0.0)
     run = np.arange(-reach, reach + 1) * side
@@ -161,7 +161,7 @@ def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[n
 
 
 def beside(height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest height difference (rows, columns) between each cell and its neighbours; 0 for none."""
+    """Return the largest height difference (rows, columns) between each cell and its neighbours; 0 if none."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     known = ~np.isnan(height)
@@ -172,7 +172,7 @@ def beside(height: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _on_ground(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArray[np.uint8]:
-    """Return the `Footing` (rows, columns) where there is ground."""
+    """Return the `Footing` (rows, columns) on ground."""
     footing = np.array([Footing.UNKNOWN, Footing.DRIVABLE, Footing.TENTATIVE, Footing.OBSTACLE], np.uint8)[
         _room_above(floor, height, robot)
     ]
@@ -182,9 +182,9 @@ def _on_ground(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArr
 
 
 def _off_ground(floor: Floor, height: NDArray[np.float64], lower: NDArray[np.int64], robot: Robot) -> NDArray[np.uint8]:
-    """Return the `Footing` (rows, columns) if there is none, seen from the nearest ground.
+    """Return the `Footing` (rows, columns) off the ground, relative to the nearest ground.
 
-    lower: (rows, columns) the lowest surface there, in cells, as high as can be if there is none.
+    lower: (rows, columns) the lowest surface there, in cells, the largest integer if there is none.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces on which something can stand, and which of them are the ground."""
+"""Surfaces that can be stood on, and the ground among them."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from stereovox.products.floor.floor_axes import MAX_CELLS, floor_axes
 from stereovox.products.neighbours import components
 
 TIE = 1e-6
-"""Cells: lengths that are so near to whole cells are."""
+"""Rounding tolerance in cells."""
 NO_SURFACE = 2**40
-"""Stands for a level, in cells, if there is no surface."""
+"""Level, in cells, of a column without a surface."""
 LARGE = 0.25
-"""A floor has at least such a part of the cells of the largest surface: tables may be seen better than floors."""
+"""Least size of a floor as a share of the largest surface: tables may be seen better than floors."""
 BESIDE = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Half of the eight columns next to one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """The columns of cells of a map, in a picture from above just large enough for what is known.
+    """The columns of cells of a map, as a picture from above just large enough for the known cells.
 
     axes, sign: see `floor_axes`. first: (2,) lowest column and row in cells; shape: rows, columns. resolution: side of
-    a cell across the floor; side: that along `up`.
+    a cell across the floor; side: its height along `up`.
     """
 
     voxel_map: VoxelMap
@@ -49,7 +49,7 @@ class Floor:
         return x, y, 0.0
 
     def points(self, rows: ArrayLike, columns: ArrayLike, heights: ArrayLike) -> NDArray[np.float64]:
-        """Return places (N, 3) in metres, world frame; rows and columns in cells, a half is the middle of the first."""
+        """Return places (N, 3) in metres, world frame; rows and columns in cells; 0.5 is the middle of the first."""
         rows, columns, heights = np.broadcast_arrays(rows, columns, heights)
         points = np.empty((rows.size, 3))
         points[:, self.axes[0]] = (columns + self.first[0]) * self.resolution
@@ -58,7 +58,7 @@ class Floor:
         return points
 
     def surfaces(self, height: float, step: float) -> NDArray[np.int64]:
-        """Return row, column and level (N, 3), in cells, of upper faces with room for `height` metres above them.
+        """Return row, column and level (N, 3), in cells, of upper faces with `height` metres of room above them.
 
         Nothing is occupied there; a free cell begins no more than `step` metres above the face, so that it was seen.
         """
@@ -88,7 +88,7 @@ def floor_of(voxel_map: VoxelMap) -> Floor:
         voxel_map = in_cubes(voxel_map)
     bounds, cell = voxel_map.bounds(), voxel_map.config.cell
     if bounds is None:
-        raise StereovoxError("the map is empty: there is no floor to look at")
+        raise StereovoxError("the map is empty: it has no floor")
     low, high = np.rint(bounds[:, [x, y]] / cell[x]).astype(np.int64)
     columns, rows = (high - low).tolist()
     if rows * columns > MAX_CELLS:
@@ -101,7 +101,7 @@ def ground_levels(
 ) -> tuple[np.ma.MaskedArray, NDArray[np.int64]]:
     """Return the level of the ground (rows, columns) in cells, masked if there is none, and of the lowest surface.
 
-    What is NO_SURFACE has no surface at all. Raises StereovoxError if there is no ground.
+    Columns at NO_SURFACE have no surface at all. Raises StereovoxError if there is no ground.
     """
     surfaces = floor.surfaces(height, step)
     if not len(surfaces):
@@ -128,14 +128,14 @@ def place_of(floor: Floor, start: ArrayLike) -> NDArray[np.float64]:
 
 
 def _lowest_large(surfaces: NDArray[np.int64], group: NDArray[np.int32]) -> np.intp:
-    """Return the group that is lowest in the mean, of those that are large enough for a floor."""
+    """Return the group with the lowest mean among those large enough for a floor."""
     size = np.bincount(group)
     mean = np.bincount(group, surfaces[:, 2]) / size
     return np.argmin(np.where(size >= LARGE * size.max(), mean, np.inf))
 
 
 def nearest_surface(floor: Floor, surfaces: NDArray[np.int64], here: NDArray[np.float64]) -> np.intp:
-    """Return which surface is nearest to a place."""
+    """Return the index of the surface nearest to a place."""
     away = (surfaces + np.array([0.5, 0.5, 0]) - here) * [floor.resolution, floor.resolution, floor.side]
     return np.argmin((away**2).sum(axis=1))
 
@@ -147,7 +147,7 @@ def one_level(
     order = np.argsort(-surfaces[:, 2] if here is None else -np.abs(surfaces[:, 2] - here[2]), kind="stable")
     levels = np.full(shape, NO_SURFACE, np.int64)
     rows, columns, heights = surfaces[order].T
-    levels[rows, columns] = heights  # of several the last one stays
+    levels[rows, columns] = heights  # of several the last one wins
     return levels
 
 
@@ -158,7 +158,7 @@ def add_islands(
     climb: int | NDArray[np.integer],
     here: NDArray[np.float64] | None,
 ) -> None:
-    """Add to `levels` the groups of surfaces that are no more than `climb` higher or lower than the nearest ground.
+    """Add to `levels` the groups of surfaces at most `climb` higher or lower than the nearest ground.
 
     climb: in cells, for all groups or (groups,) for each.
     """
@@ -167,7 +167,7 @@ def add_islands(
     away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
     rows, columns, heights = surfaces.T
     run, rise = away[rows, columns], np.abs(heights - levels[tuple(nearest[:, rows, columns])])
-    order = np.lexsort((rise, run))  # the nearest of each group comes first
+    order = np.lexsort((rise, run))  # the nearest of each group first
     _, firsts = np.unique(group[order], return_index=True)
     level = rise[order[firsts]] <= climb
     more = one_level(levels.shape, surfaces[level[group]], here)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a vehicle can go at one height without leaving what is known to be free, and the middle of that place."""
+"""Paths of a vehicle at one height through known free space, and the middle of that space."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.query.queries import points_of
 
 CLEAR = 0.3
-"""A step costs as much more than its length as this, in metres, is of the room about it: ways keep to the middle."""
+"""A step costs its length times 1 + this (metres) over the clearance: paths keep to the middle."""
 SIDES = ((1, 0), (0, 1), (1, 1), (1, -1))
-"""Steps to neighbours; each leads both ways."""
+"""Steps to neighbours; each also counts in reverse."""
 
 
 class LevelPlanner:
-    """Shortest ways of a ball at one height through columns of cells that are known to be free.
+    """Shortest paths of a ball at one height through known free columns of cells.
 
-    A column is free where all its cells in a band about the height are. Of a map whose `up` is z.
+    A column is free if all its cells in a band around the height are. The map's `up` must be z.
 
     Args:
-        voxel_map: The map; what it learns later is not seen.
-        start: (3,) metres, where the ball is.
+        voxel_map: The map, as it is now; later changes are not seen.
+        start: (3,) metres, position of the ball.
         radius: Its radius in metres.
         half_height: Metres above and below it within which cells must be free.
-        own_radius: Horizontal metres about the start within which unknown and tentative cells are its own place.
+        own_radius: Horizontal metres around the start within which unknown and tentative cells count as its own place.
 
     Attributes:
         start: (3,) metres.
@@ -53,23 +53,23 @@ class LevelPlanner:
         self._room = _room(free | own, self._cell)
 
     def middle(self) -> tuple[NDArray[np.float64], float] | None:
-        """Return the place (3,) it can come to with the most room about it, and that room in metres.
+        """Return the reachable place (3,) with the most clearance, and that clearance in metres.
 
-        This is the middle of a room as far as it is known (Chien 2020, 5.1). None if it cannot move at all.
+        This is the middle of the known part of a room (Chien 2020, 5.1). None if it cannot move at all.
         """
         room = np.where(np.isfinite(self._search[0].reshape(self._room.shape)), self._room, -1)
         best = np.unravel_index(np.argmax(room), room.shape)
         return (self._place(np.array(best)), float(room[best])) if room[best] > 0 else None
 
     def path_to(self, goal: ArrayLike, near: float = 0.3) -> NDArray[np.float64] | None:
-        """Return the way (N, 3) in metres from the start to the place nearest to a goal.
+        """Return the path (N, 3) in metres from the start to the place nearest to a goal.
 
         Args:
             goal: (3,) metres; only x and y count.
             near: Metres by which the end may miss the goal.
 
         Returns:
-            Places at the start's height; None if there is no way.
+            Places at the start's height; None if there is no path.
         """
         reached = np.flatnonzero(np.isfinite(self._search[0]))
         if not len(reached):
@@ -79,7 +79,7 @@ class LevelPlanner:
         return None if away.min() > near else self._way(int(reached[np.argmin(away)]))
 
     def _way(self, column: int) -> NDArray[np.float64]:
-        """Return the way (N, 3) from the start to a column that is reached."""
+        """Return the path (N, 3) from the start to a reached column."""
         before, columns = self._search[1], [column]
         while before[columns[-1]] >= 0:
             columns.append(int(before[columns[-1]]))
@@ -101,13 +101,13 @@ class LevelPlanner:
 
     @cached_property
     def _search(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Lengths of the ways to all columns (n * m,), infinite if there is none, and the column before each."""
+        """Return path costs to all columns (n * m,), infinite if there is none, and the column before each."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
         fits, number = self._room > self._radius, self._room.size
         start = np.floor(self.start / self._cell).astype(int)[:2] - self._first[:2]
-        fits[tuple(start)] = True  # it is there, whatever the map says
+        fits[tuple(start)] = True  # the vehicle is there, whatever the map says
         rows, columns, costs = [], [], []
         index = np.arange(number).reshape(self._room.shape)
         for step in SIDES:
@@ -130,10 +130,10 @@ class LevelPlanner:
 
 
 def _room(free: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far from any point of each column (n, m) the nearest one is that is not free, at least."""
+    """Return a lower bound on the distance from any point of each column (n, m) to the nearest non-free one."""
     from scipy.ndimage import distance_transform_edt
 
-    closed = np.pad(free, 1)  # what lies outside is not known
+    closed = np.pad(free, 1)  # everything outside is unknown
     between = np.asarray(distance_transform_edt(closed, sampling=cell[:2]))[1:-1, 1:-1]
     return np.maximum(between - np.hypot(*cell[:2]), 0)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A 3-D map seen from above, kept up to date while it is built: only what changed is projected again."""
+"""A 3-D map seen from above, kept up to date while it is built: only changes are projected again."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAX_CELLS = 2**26
 FLOOR_S = 1.0
 """Seconds between two searches for the floor."""
 SHARE = 10.0
-"""The next search waits so many times as long as the last one took."""
+"""The next search waits this many times as long as the last one took."""
 TOLD_AFTER = 3
 """Searches without a floor after which the user is informed."""
 
@@ -39,18 +39,18 @@ TOLD_AFTER = 3
 class LiveProjection:
     """Projects a map from above, as `projection.project`, at the cost of what changed.
 
-    The floor is sought anew at most once each `floor_s` seconds, and takes at most a tenth of the time; places whose
-    floor moved are projected again. While no floor is known, every cell is unknown. The grid covers what is known, in
-    steps of 64 cells. Of a map in a window only the cells in memory count; such a map, and one that forgets, is
+    The floor is searched again at most every `floor_s` seconds, and takes at most a tenth of the time; places whose
+    floor moved are projected again. While no floor is known, every cell is unknown. The grid covers the known region,
+    in steps of 64 cells. Of a map in a window only the cells in memory count; such a map, and one that forgets, is
     projected as a whole each time.
 
     Args:
         voxel_map: The map.
         heights: As for `project`.
-        floor: Metres along the map's `up` of a floor that is stated to be level; None: as `scan.floor` states, or else
+        floor: Metres along the map's `up` of a floor stated to be level; None: as `scan.floor` states, or else
             it is found.
         floor_s: Seconds between two searches for the floor.
-        notify: Called once with a line, if the map goes on without a floor.
+        notify: Called once with a line if the map remains without a floor.
         clock: Monotonic seconds.
 
     Raises:
@@ -82,7 +82,7 @@ class LiveProjection:
         self._whole = isinstance(voxel_map, RollingMap) or config.map.forget_s is not None
         self._changed = EVERYWHERE.copy()
         self._canvas = _Canvas()
-        note = WeakMethod(self._note)  # the map does not keep alive what only looks at it
+        note = WeakMethod(self._note)  # the map must not keep its observer alive
         voxel_map.storage.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
     @property
@@ -100,7 +100,7 @@ class LiveProjection:
             return self._grid()
 
     def _seek_floor(self) -> None:
-        """Find the floor if that is due and the map changed, and note where it moved."""
+        """Find the floor if due and the map changed, and record where it moved."""
         now = self._clock()
         if self._stated or not self._seek or now < self._due:
             return
@@ -118,7 +118,7 @@ class LiveProjection:
             self._changed[:, self._order[2]] = EVERYWHERE[:, self._order[2]]
 
     def _note(self, evidence: Evidence) -> None:
-        """Add the columns that a frame changed to those to be projected again."""
+        """Mark the columns that a frame changed for projection."""
         self._seek = True
         for coords in (evidence.coords, evidence.uniform):
             if len(coords):
@@ -132,7 +132,7 @@ class LiveProjection:
         if self._whole:
             self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
         coords, cells = self._map.storage.blocks_within(*self._changed)
-        self._canvas.clear(*(SIDE * self._changed[:, self._order[:2]]))  # corrections take blocks away
+        self._canvas.clear(*(SIDE * self._changed[:, self._order[:2]]))  # corrections remove blocks
         if len(coords):
             floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
             self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
@@ -158,7 +158,7 @@ class _Canvas:
         self.cells = np.empty((0, 0), np.int8)
 
     def paint(self, patch: NDArray[np.int8], corner: NDArray[np.int64]) -> None:
-        """Overwrite a part of the canvas with a patch that lies inside it."""
+        """Overwrite a part of the canvas with a patch inside it."""
         left, bottom = (corner - self.corner).tolist()
         self.cells[bottom : bottom + patch.shape[0], left : left + patch.shape[1]] = patch
 

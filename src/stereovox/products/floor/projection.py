@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A 3-D map seen from above: the 2-D grid in which a ground robot plans, and obstacles inflated by a robot's radius.
+"""A 3-D map seen from above: the 2-D planning grid of a ground robot, and obstacles inflated by its radius.
 
 Chien 2020 (5): occupied cells may reach one cell too far or not far enough, therefore "a one cell margin is required
 for path planning and obstacle avoidance".
@@ -32,7 +32,7 @@ TILE = 64
 """Cells along each side of the boxes in which a map is processed."""
 INFLATE_TIE = 1e-6
 EMPTY = np.iinfo(np.int16).min
-"""Stored value of a column in which nothing is known; no cell is stored as this."""
+"""Stored value of an unknown column; no cell has this value."""
 NEVER = -1
 
 
@@ -43,13 +43,13 @@ def project(
     floor: FloorHeights | float | None = None,
     start: ArrayLike | None = None,
 ) -> OccupancyGrid:
-    """Return the map seen from above, just large enough for what is known, as a robot on its floor needs it.
+    """Return the map seen from above, just large enough for the known cells, as a robot on its floor needs it.
 
     Heights are measured above the floor at each place, never from the world's origin. A column has the largest
-    probability of all its known cells within the heights: an occupied one makes it occupied (a table top is no
-    thicker), one that is neither keeps it from being free. It is free only if all its cells within the heights are
-    known to be free, and the floor was seen within `floor_heights.REACH`. Otherwise it is unknown: a camera that never
-    saw the top of the band does not clear it, so give the true height of a lower robot.
+    probability of its known cells within the heights: an occupied one makes it occupied (a table top is no thicker), a
+    tentative one keeps it from being free. It is free only if all its cells within the heights are known to be free,
+    and the floor was observed within `floor_heights.REACH`. Otherwise it is unknown: a camera that never saw the top of
+    the band does not clear it, so give the true height of a lower robot.
 
     The grid's x and y are the map's if z is up; else the two axes that make a right-handed frame with `up`: y and z
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes if the floor needs it.
@@ -57,9 +57,9 @@ def project(
     Args:
         voxel_map: The map.
         heights: Lowest and highest metres above the floor that a robot occupies; None: the map's own `scan.heights`.
-        floor: Height of the floor at each place; a number states that it is level, at so many metres along the map's
-            `up` from the world's origin; None: it is found.
-        start: (3,) metres, near the floor that counts, where it is found; see `find_floor`.
+        floor: Height of the floor at each place; a number states a level floor, in metres along the map's `up` from the
+            world's origin; None: it is found.
+        start: (3,) metres, near the wanted floor, if it is to be found; see `find_floor`.
 
     Returns:
         The grid. Cells above an unknown floor are unknown.
@@ -108,7 +108,7 @@ def patch_of(
     floor: FloorHeights,
     heights: Heights,
 ) -> Patch:
-    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
+    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, look like from above.
 
     order: axes along columns, along rows and up, see `floor_axes`.
     """
@@ -164,8 +164,8 @@ def inflated_mask(
 ) -> NDArray[np.bool_]:
     """Return the cells that a robot's centre must avoid: (x, y, z) or (rows, columns) bool, as `blocked`.
 
-    Anywhere in the other cells no obstacle is nearer than `radius` metres, even if each is larger by `margin` cells on
-    all sides. sides: of a cell in metres, one per axis. What is outside counts for nothing. Raises StereovoxError for a
+    No point of the other cells is nearer than `radius` metres to an obstacle, even if each is larger by `margin` cells
+    on all sides. sides: of a cell in metres, one per axis. Cells outside do not count. Raises StereovoxError for a
     radius that is not above 0 or a margin below 0.
     """
     _check(radius, margin)
@@ -176,7 +176,7 @@ def inflated_mask(
 
 
 def _tiles(cells: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-    """Return cells (N, 3) in groups that lie close together."""
+    """Return cells (N, 3) in compact groups."""
     if not len(cells):
         return []
     _, of_cell, number = np.unique(cells // TILE, axis=0, return_inverse=True, return_counts=True)

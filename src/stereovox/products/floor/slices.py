@@ -15,16 +15,16 @@ from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.storage.blocks import SIDE
 
 ACROSS = {"x": ("y", "z"), "y": ("x", "z"), "z": ("x", "y")}
-"""For the axis a layer stands across: the axes of its columns and of its rows."""
+"""For the normal axis of a layer: the axes of its columns and of its rows."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
     """One layer of cells.
 
-    log_odds: (rows, columns) float32, NaN where unknown; state: (rows, columns) uint8 of `State`; row 0 and column 0
-    are the lowest. extent: left, right, bottom, top in metres. axes: names of columns' and rows' axis. at_m: where the
-    middle of the layer stands on its axis `across`.
+    log_odds: (rows, columns) float32, NaN if unknown; state: (rows, columns) uint8 of `State`; row 0 and column 0
+    are the lowest. extent: left, right, bottom, top in metres. axes: names of the axes of columns and rows. at_m:
+    position of the layer's middle on its axis `across`.
     """
 
     log_odds: NDArray[np.float32]
@@ -37,7 +37,7 @@ class Layer:
 
 @one_state
 def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.float64] | None = None) -> Layer:
-    """Return the layer that holds the plane `across` = `at_m` metres, as large as the map's known cells.
+    """Return the layer that contains the plane `across` = `at_m` metres, as large as the map's known cells.
 
     bounds: `voxel_map.bounds()`, if the caller has it already: it takes longer than the rest.
     Raises StereovoxError if `across` is none of x, y, z, `at_m` is no number, or the map is empty.
@@ -67,9 +67,9 @@ def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.floa
 def along_ray(
     voxel_map: VoxelMap, origin: ArrayLike, direction: ArrayLike, length_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return what a ray meets: distance (N + 1,) in metres at which it enters each cell, and its end; log-odds (N,).
+    """Return the cells along a ray: distance (N + 1,) in metres of each cell's entry, and of the end; log-odds (N,).
 
-    origin (3,) in metres, direction (3,) of any length but zero, world frame. Log-odds are 0 if nothing is known.
+    origin (3,) in metres, direction (3,) of any length but zero, world frame. Log-odds are 0 if unknown.
     """
     start, towards = np.asarray(origin, float), np.asarray(direction, float)
     if not np.linalg.norm(towards) > 0:
@@ -89,7 +89,7 @@ def along_ray(
 def _stored(
     voxel_map: VoxelMap, number: int, axes: tuple[int, int, int], blocks: tuple[int, int, int, int]
 ) -> NDArray[np.integer]:
-    """Return the cells (rows, columns) as stored of layer `number`, of the blocks left, bottom, right, top, all in."""
+    """Return the cells (rows, columns) as stored of layer `number`, of the blocks left, bottom, right, top."""
     normal, columns, rows = axes
     low, high = np.array(blocks).reshape(2, 2)
     cell_format = voxel_map.storage.cell_format
@@ -101,5 +101,5 @@ def _stored(
         here = (coords[:, normal] == number >> 3) & (place >= low).all(axis=1) & (place <= high).all(axis=1)
         column, row = (place[here] - low).T
         cubes = np.moveaxis(cells[here].reshape(-1, SIDE, SIDE, SIDE), 1 + normal, 1)
-        found[row, :, column] = cubes[:, number & 7].swapaxes(1, 2)  # a block counts its lower axis first: the columns
+        found[row, :, column] = cubes[:, number & 7].swapaxes(1, 2)  # a block's lower axis is first: the columns
     return found.reshape(shape[0] * SIDE, -1)

@@ -86,7 +86,7 @@ def test_a_clock_that_is_set_is_found_and_corrected(step_s):
     assert first.startswith("left: images come")
     assert "--clock-offset" in first
     assert f"its clock is {'+-'[step_s < 0]}0." in then
-    assert "taken off from now on" in then
+    assert "corrected from now on" in then
 
 
 def test_images_that_come_later_with_right_stamps_are_mapped_where_they_were_taken():

@@ -139,7 +139,7 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
         monkeypatch.setattr(one, "recording", "walk")
     steps = []
     joined = sv.join(a, b, lambda done, total, doing: steps.append(doing))
-    assert "finding the second map in the first" in steps
+    assert "locating the second map in the first" in steps
     assert joined.found >= 3
     assert joined.map.recording == "walk, poses corrected"  # it cannot be gone on with
     assert joined.map.history.loops.counts()["closed"] == joined.loops

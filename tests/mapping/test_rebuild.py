@@ -171,7 +171,7 @@ def test_a_lidar_of_numpy_numbers_is_saved_with_its_clouds(tmp_path):
 
 def test_loops_of_clouds_are_not_sought_and_that_is_said(tmp_path):
     mapped(made_clouds(), voxel_size=0.2).save(tmp_path / "m.svox")
-    with pytest.raises(StereovoxError, match=r"cloud 0: loops are sought among depth images.*stereovox remap"):
+    with pytest.raises(StereovoxError, match=r"cloud 0: loops are searched in depth images.*stereovox remap"):
         sv.close_loops(tmp_path / "m.svox", tmp_path / "closed.svox")
 
 

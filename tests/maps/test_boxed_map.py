@@ -242,7 +242,7 @@ def test_damage_is_told_by_the_box(where):
         sv.load_map(where).storage.blocks()
     assert "\n" not in str(error.value)
     place.remove([name])
-    with pytest.raises(MapFileError, match=f"{entry.name}: is not there; .* load it again"):
+    with pytest.raises(MapFileError, match=f"{entry.name}: is missing; .* load it again"):
         sv.load_map(where).storage.blocks()
 
 

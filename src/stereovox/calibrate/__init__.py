@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration from recordings: depth errors and noise of a camera, stereo lenses, and a camera's place on a tracker."""
+"""Calibration from recordings: depth errors and noise of a camera, stereo lenses, and a camera's mount on a tracker."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chessboards: their inner corners in images, to a fraction of a pixel, and image files that belong together."""
+"""Chessboards: their inner corners in images, to a fraction of a pixel, and matching image files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 SIDES = re.compile(r"left|right|(?<![a-z])[lr](?![a-z])|[LR](?=[^A-Za-z]*$)", re.IGNORECASE)
 """Marks the eye in a file name without its ending: left01, cam_r_3, imageL0."""
 WIDEST_WINDOW = 11
-"""Pixels on each side of a corner in which it is made precise; less where squares are small."""
+"""Pixels on each side of a corner used to refine it; fewer for small squares."""
 MAX_PIXELS = 100_000_000
 """Headers that claim more pixels are rejected; nothing is allocated for them."""
 
@@ -48,7 +48,7 @@ class Board:
 
 
 def find_corners(image: NDArray[np.uint8], board: Board) -> NDArray[np.float64] | None:
-    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None if it is not seen."""
+    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None if there is none."""
     import cv2
 
     size = (board.columns, board.rows)
@@ -65,7 +65,7 @@ def find_corners(image: NDArray[np.uint8], board: Board) -> NDArray[np.float64] 
 
 
 def same_order(corners: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `corners` of one eye, turned round where the other eye's were found from the opposite end."""
+    """Return `corners` of one eye, reversed if the other eye's were found from the opposite end."""
     return corners if (corners[-1] - corners[0]) @ (other[-1] - other[0]) > 0 else corners[::-1]
 
 
@@ -86,7 +86,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | None:
 
 
 def unmatched(folder: str | os.PathLike[str]) -> list[str]:
-    """Return the names of the images in `folder` that belong to one eye and have no partner of the other."""
+    """Return the names of the images in `folder` of one eye without a partner of the other."""
     eyes = _eyes(Path(folder))
     return sorted(
         path.name for ours, theirs in ("lr", "rl") for key, path in eyes[ours].items() if key not in eyes[theirs]
@@ -112,7 +112,7 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
 
 
 def _eyes(where: Path) -> dict[str, dict[str, Path]]:
-    """Return for `l` and `r` the images of that eye by what is the same in both names."""
+    """Return, for `l` and `r`, the images of that eye by the common part of both names."""
     below = [where / "left", where / "right"]
     files = [path for place in (below if all(map(Path.is_dir, below)) else [where]) for path in sorted(place.iterdir())]
     eyes: dict[str, dict[str, Path]] = {"l": {}, "r": {}}
@@ -124,7 +124,7 @@ def _eyes(where: Path) -> dict[str, dict[str, Path]]:
 
 
 def _side(path: Path) -> tuple[str, str]:
-    """Return `l` or `r` and what is the same in the name of the other eye's image; empty if it tells no eye."""
+    """Return `l` or `r` and the part of the name common to both eyes; empty if it names no eye."""
     if path.parent.name in ("left", "right"):
         return path.parent.name[0], path.stem
     found = SIDES.search(path.stem)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike the errors of neighbouring pixels are, and so how many independent measurements a patch of pixels holds."""
+"""Correlation of the errors of neighbouring pixels, and the number of independent measurements in a patch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from stereovox.sensors.noise import kept_by_means
 LAGS = 16
 """Pixels up to which errors are compared."""
 SHAPE_FROM = 12
-"""What is still alike at this lag and beyond is the shape of the wall's image, not noise, and is taken off."""
+"""Correlation at this lag and beyond is due to the shape of the wall's image, not noise, and is subtracted."""
 LEAST = 0.05
-"""A correlation below this counts as none: it ends the sum."""
+"""A correlation below this counts as zero and ends the sum."""
 INDEPENDENT = 1.02
-"""Sums up to this are those of independent pixels."""
+"""Sums up to this mean independent pixels."""
 WIDEST_PX = 8.0
-"""Standard deviation in pixels up to which a Gaussian is looked for."""
+"""Largest standard deviation in pixels of the fitted Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Correlation:
 
     @classmethod
     def of(cls, products: NDArray[np.float64]) -> Correlation:
-        """Return the correlation from sums as `add_products` makes them; that of independent pixels without errors."""
+        """Return the correlation from sums as `add_products` makes them; independent pixels if there are no errors."""
         means = products[..., 0] / np.maximum(products[..., 1], 1)
         if not (means[:, 0] > 0).all():
             means = np.broadcast_to(np.arange(LAGS + 1) == 0, means.shape).astype(float)
@@ -46,9 +46,9 @@ class Correlation:
 
     @property
     def length_px(self) -> float:
-        """Standard deviation in pixels of the Gaussian that makes means of large patches of independent noise as noisy.
+        """Standard deviation in pixels of the Gaussian that, smoothing independent noise, makes large patches as noisy.
 
-        0: pixels are independent. Of noise smoothed by such a Gaussian the correlation falls to 1/e at twice that.
+        0: pixels are independent. For noise smoothed by it the correlation falls to 1/e at twice that.
         """
         share = sqrt(_sum(self.rows) * _sum(self.columns))
         if share < INDEPENDENT:
@@ -58,14 +58,14 @@ class Correlation:
 
     @property
     def falls_to_1_e_px(self) -> tuple[float, float]:
-        """At how many pixels the correlation along rows and along columns falls to 1/e; LAGS where it does not."""
+        """Pixels at which the correlation along rows and along columns falls to 1/e; LAGS if it does not."""
         return _falls(self.rows), _falls(self.columns)
 
     def looks(self, side: int) -> float:
-        """Return how many independent measurements a patch of side x side pixels holds, for side up to LAGS.
+        """Return the number of independent measurements in a patch of side x side pixels, for side up to LAGS.
 
-        That many independent ones would have a mean as noisy. The correlation along a diagonal is taken for the
-        product of those along row and column, as it is of a Gaussian.
+        That many independent ones would have an equally noisy mean. The correlation along a diagonal is taken as the
+        product of row and column correlations, as for a Gaussian.
         """
         weights = 1 - np.arange(side) / side
         counts = [1 + 2 * float(np.sum(weights[1:] * line[1:side])) for line in (self.rows, self.columns)]
@@ -73,7 +73,7 @@ class Correlation:
 
 
 def add_products(products: NDArray[np.float64], errors: NDArray[np.floating]) -> None:
-    """Add to `products` (2, LAGS + 1, 2) for each lag along rows and columns: the products' sum and their number.
+    """Add to `products` (2, LAGS + 1, 2), for each lag along rows and columns, the products' sum and number.
 
     errors: (height, width), NaN if there is none.
     """
@@ -92,7 +92,7 @@ def add_products(products: NDArray[np.float64], errors: NDArray[np.floating]) ->
 
 
 def _sum(line: tuple[float, ...]) -> float:
-    """Return the sum of a correlation over lags of both signs, up to where it ends."""
+    """Return the sum of a correlation over lags of both signs, up to its end."""
     values = np.array(line)
     ends = np.flatnonzero(values < LEAST)
     return 1 + 2 * float(values[1 : ends[0] if ends.size else len(values)].sum())

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clock of a camera that runs now: noticed where it was set, found from motion, and corrected.
+"""The clock of a live camera: changes are noticed, measured from motion, and corrected.
 
-`ClockWatch` notices that images come earlier or later than they should, which does not say whether their stamps are
-wrong. The camera's own motion, tracked from its images, does: it fits that of the poses at one offset of the clocks.
-Until that is found, an image is refused unless its pose is the same either way, since the body rests.
+`ClockWatch` notices images that arrive earlier or later than expected, which does not show whether their stamps are
+wrong. The camera's own motion, tracked from its images, does: it fits the poses' motion at one clock offset. Until that
+is found, an image is refused unless the body rests and its pose is the same either way.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracker
 
 REASON = "clock_doubt"
-"""Why images are refused whose clock may be wrong."""
+"""Reason of refusal of images whose clock may be wrong."""
 TELL_NS, REMIND_NS = 300_000_000, 10_000_000_000
 """How long a doubt lasts until the user is informed, and until the user is informed again."""
 SAME_M, SAME_RAD, SAMPLES = 0.02, np.radians(0.5), 5
-"""A body that moves by less between the two times that an image may be of, seen at so many times, rests."""
+"""A body rests if it moves by less between the two possible times of an image, at this many samples."""
 BEFORE_NS, AFTER_NS = 500_000_000, 300_000_000
-"""How much longer a camera may take to deliver an image than poses take to come, and how much less."""
+"""How much longer, and how much less, an image may take to arrive than poses."""
 GRID_NS, ALIKE_NS = 20_000_000, 100_000_000
-"""Between the offsets that are tried, and by which two differ that are not told from each other."""
+"""Step between tried offsets, and difference below which two are not distinguished."""
 APART = 0.4
-"""The same for small changes of the delay, as a share: zero must be told from all of it."""
+"""The same for small changes of the delay, as a share: zero must be distinguishable from the whole change."""
 PAIR_NS, LONGEST_NS, MOST_PAIRS = 200_000_000, 450_000_000, 60
-"""Time between the two images of a pair, at least and at most, and how many of the last pairs are compared."""
+"""Least and largest time between the images of a pair, and number of latest pairs compared."""
 FEWEST, COVERED = 8, 0.6
-"""Fewest pairs that say something, and share of them that must lie among the poses."""
+"""Fewest pairs needed, and least share of them within the poses' time span."""
 TURN_RAD, WAY_M, CAP = np.radians(0.6), 0.015, 25.0
-"""Errors of a tracked motion and of a mount, as squares of which misfits count, each at most this much."""
+"""Errors of a tracked motion and of a mount, which scale misfits; cap on each squared misfit."""
 EXPLAINED, UNIQUE, SURE = 0.25, 2.0, 25.0
-"""An offset must leave no more than this share of the motion; others must fit so many times worse, and by so much."""
+"""An offset may leave at most this share of the motion; others must fit this many times worse, and by this much."""
 
 
 class PosesNow(Protocol):
-    """The poses of a body as they come."""
+    """The poses of a body as they arrive."""
 
     def at(self, stamp_ns: int) -> Transform:
         """Return T_world_body (4, 4) at a time; raises FrameRefused."""
         ...
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, None if there are fewer than two."""
+        """Return the poses of a time span, None if there are fewer than two."""
         ...
 
 
 class MotionClock:
-    """Finds by how much the stamps of images are off, from their motion and that of the poses.
+    """Finds the error of image stamps, from their motion and the poses' motion.
 
     T_body_camera: (4, 4) float64, the mount of the camera.
     """
@@ -71,7 +71,7 @@ class MotionClock:
         self._pairs: list[tuple[int, int, Transform]] = []
 
     def see(self, frame: AnyFrame) -> None:
-        """Track an image, whose stamp is by the clock of the poses as far as is known."""
+        """Track an image, whose stamp is by the poses' clock as far as known."""
         tracked = self._tracker.add(frame)
         if tracked.lost:
             self._tracked.clear()
@@ -87,9 +87,9 @@ class MotionClock:
         del self._pairs[:-MOST_PAIRS]
 
     def shift_ns(self, low_ns: int, high_ns: int, alike_ns: int = ALIKE_NS) -> int | None:
-        """Return what must be added to stamps, between two limits, to be those of the poses; None: it is not certain.
+        """Return the shift, between two limits, from stamps to the poses' clock; None if it is uncertain.
 
-        Zero, and whatever lies near it, is among those that are tried. alike_ns: by which two may differ that both fit.
+        Zero and its surroundings are always tried. alike_ns: difference of two fitting shifts that count as one.
         """
         if len(self._pairs) < FEWEST:
             return None
@@ -112,7 +112,7 @@ class MotionClock:
     def _is_unique(
         self, others: NDArray[np.bool_], misfits: NDArray[np.float64], usual: NDArray[np.float64], best: int
     ) -> bool:
-        """Return whether all other offsets fit clearly worse, as far as poses are known."""
+        """Return whether all other offsets fit clearly worse, among those with known poses."""
         for k in np.flatnonzero(np.isfinite(usual) & others):
             both = np.isfinite(misfits[k]) & np.isfinite(misfits[best])
             here, there = misfits[best][both].sum(), misfits[k][both].sum()
@@ -130,7 +130,7 @@ class MotionClock:
             poses = self._poses.between(first_ns + int(shifts[part[0]]), last_ns + int(shifts[part[-1]]))
             try:
                 track = None if poses is None else PoseTrack(poses, 0.0, 10.0, 720.0)
-            except StereovoxError:  # none of these poses can be used
+            except StereovoxError:  # no usable pose among these
                 track = None
             if track is None or len(track.times) < 2:
                 continue
@@ -149,21 +149,21 @@ class MotionClock:
 
 
 class CameraClock:
-    """Watches the clock of one camera against that of the poses, tells the user, and corrects it.
+    """Watches the clock of one camera against the poses' clock, notifies the user, and corrects it.
 
     Args:
-        name: What the camera is called, for messages.
-        poses: Those of the body.
-        delays: Their delays, which whoever receives them takes in.
+        name: Name of the camera, for messages.
+        poses: Poses of the body.
+        delays: Their delays, updated by their receiver.
         T_body_camera: (4, 4) float64, the mount.
         notify: Called with each line that a user should see.
-        cure: Returns what the user can do, from the doubt and the seconds that the clock then is ahead of the poses'.
+        cure: Returns the user's cure, from the doubt and the seconds by which the clock is ahead of the poses'.
         background: Whether images are tracked in a thread.
-        start_ns: By how much images and poses of the same time may come apart at the start.
+        start_ns: Largest difference in arrival of images and poses of the same time at the start.
 
     Attributes:
         config: Settings, for tracking.
-        shift_ns: What was found from motion, and is to be added to stamps.
+        shift_ns: Shift found from motion, to be added to stamps.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class CameraClock:
         self._failed = ""
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> Heard:
-        """Take in the stamp of an image, corrected. arrived_ns: monotonic."""
+        """Record the stamp of an image, corrected. arrived_ns: monotonic."""
         set_back = self._delays.set_back
         return Heard(self._watch.heard(stamp_ns, arrived_ns), set_back)
 
@@ -215,7 +215,7 @@ class CameraClock:
             raise FrameRefused(REASON, f"{name_of(frame)}: the clock of the poses was set back while it waited")
 
     def close(self) -> None:
-        """End what runs in the background."""
+        """Stop background work."""
         if self._worker is not None:
             self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -227,7 +227,7 @@ class CameraClock:
         return how if self._failed else f"move the camera until its motion shows it, or {how}"
 
     def _learn(self, frame: AnyFrame | Scan, doubt: ClockDoubt, now_ns: int) -> None:
-        """Track an image of an open doubt, and end the doubt where its motion says enough; tell the user of both."""
+        """Track an image during a doubt, and end the doubt once its motion decides it; notify the user of both."""
         if doubt is not self._doubt:
             self._doubt, self._motion, self._failed, self._told_ns = doubt, None, "", now_ns
         if isinstance(frame, Cloud | Scan):
@@ -266,16 +266,16 @@ class CameraClock:
             self._notify(f"{self._name}: its motion shows that images come later {late}, and stamps are right")
             return
         if not doubt.start and abs(shift_ns - doubt.off_ns) <= alike_ns:
-            shift_ns = doubt.off_ns  # arrivals say it more exactly
+            shift_ns = doubt.off_ns  # arrivals are more exact
         self.shift_ns += shift_ns
         self._watch.corrected()
         self._notify(
             f"{self._name}: its motion shows that its clock is {-shift_ns / 1e9:+.3f} s off that of the poses, "
-            "which is taken off from now on"
+            "which is corrected from now on"
         )
 
     def _rests(self, stamp_ns: int, doubt: ClockDoubt) -> bool:
-        """Return whether the pose is the same at all times that an image may be of."""
+        """Return whether the pose is the same at all possible times of an image."""
         low_ns, high_ns = _range(doubt) if doubt.start else Limits(min(doubt.off_ns, 0), max(doubt.off_ns, 0))
         times = np.linspace(stamp_ns + min(low_ns, 0), stamp_ns + max(high_ns, 0), SAMPLES).astype(np.int64).tolist()
         try:
@@ -296,9 +296,9 @@ class Limits(NamedTuple):
 
 
 def _range(doubt: ClockDoubt) -> Limits:
-    """Return what may have to be added to stamps.
+    """Return the range of possible shifts of stamps.
 
-    At the start nobody knows how long camera and poses take; later it is zero or what the delay has changed by.
+    At the start the delays of camera and poses are unknown; later it is zero or the change of the delay.
     """
     if doubt.start:
         return Limits(doubt.off_ns - BEFORE_NS, doubt.off_ns + AFTER_NS)
@@ -306,7 +306,7 @@ def _range(doubt: ClockDoubt) -> Limits:
 
 
 def doubt_words(doubt: ClockDoubt) -> str:
-    """Say what is doubted."""
+    """Return the doubt in words."""
     seconds, later = abs(doubt.off_ns) / 1e9, doubt.off_ns > 0
     if doubt.start:
         clock = f"its clock is {'behind' if later else 'ahead of'} that of the poses"
@@ -316,12 +316,12 @@ def doubt_words(doubt: ClockDoubt) -> str:
 
 
 def _near_each_other(shifts: NDArray[np.int64]) -> list[NDArray[np.intp]]:
-    """Return the places of ascending shifts, divided where they leave out a second or more."""
+    """Return the indices of ascending shifts, split at gaps of a second or more."""
     return np.split(np.arange(len(shifts)), np.flatnonzero(np.diff(shifts) > 1_000_000_000) + 1)
 
 
 def _squares(T: NDArray[np.float64], rotation: type) -> NDArray[np.float64]:
-    """Return how far motions (N, 4, 4) are from none: (N,) squares, at most CAP."""
+    """Return the squared misfits (N,), at most CAP, of motions (N, 4, 4) from the identity."""
     turns = rotation.from_matrix(T[:, :3, :3]).magnitude() / TURN_RAD
     ways = np.linalg.norm(T[:, :3, 3], axis=1) / WAY_M
     return np.minimum(turns**2 + ways**2, CAP)

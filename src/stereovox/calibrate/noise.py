@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise of a depth camera, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3).
 
-Recordings in other light, with another emitter power or before another texture may be named so, and are compared as in
-his 2.2.4.1, where the share of pixels with a value is the measure of quality.
+Recordings in other light, with another emitter power or before another texture may be labelled and are compared as in
+Chien 2020, 2.2.4.1, where the share of pixels with a value is the quality measure.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from stereovox.calibrate.wall import distance_groups
 from stereovox.errors import StereovoxError
 
 REGION = (0.6, 0.4)
-"""Width and height in metres of the part of the wall round the optical axis that counts (Chien 2020, 3.3)."""
+"""Width and height in metres of the part of the wall around the optical axis that counts (Chien 2020, 3.3)."""
 MIN_PIXELS = 30
 MIN_RMSE = 1e-6
-"""Error, as a share of the depth, below which there is nothing but rounding."""
+"""Error, as a share of the depth, below which there is only rounding."""
 TERMS = ("s0", "s1", "s2")
 PATCH = 8
 """Pixels across the patches whose independent measurements are counted."""
@@ -35,15 +35,15 @@ class NoiseAt:
     """The error of single measurements at one distance, against the plane through their mean.
 
     rmse_m: root mean square error in metres, Chien's RMSE; its square is the sum of those of its two parts.
-    temporal_m: what differs from frame to frame. fixed_m: what stays the same in all frames, 0 where it drowns in the
+    temporal_m: part that differs from frame to frame. fixed_m: part equal in all frames, 0 if it is lost in the
     noise. Both are None if there is a single frame.
-    offset_m: how much too far the wall is seen, None if its distance was not measured.
+    offset_m: how much too far the wall appears, None if its distance was not measured.
     valid_share: share of the region's pixels that have a value, of all frames; image_share: of the whole image.
     gross_share: share of the image's values that are gross errors; they are in no other figure.
     subpixel: the disparity error in pixels that makes rmse_m (Chien 2020, Eq 3.5), None without a baseline.
-    correlation_px, falls_to_1_e_px, looks: how alike the errors of neighbouring pixels are, see `Correlation`; looks
-    are those in a patch of 8 x 8 pixels. grey: mean grey level of the pixels with a value, None if it is not known.
-    condition: in what light, with which emitter power or before which texture, in words.
+    correlation_px, falls_to_1_e_px, looks: correlation of the errors of neighbouring pixels, see `Correlation`; looks
+    are for a patch of 8 x 8 pixels. grey: mean grey level of the pixels with a value, None if unknown.
+    condition: light, emitter power or texture, in words.
     """
 
     name: str
@@ -67,10 +67,10 @@ class NoiseAt:
 
 @dataclass(frozen=True)
 class ConditionNoise:
-    """What the recordings in one condition have in common (Chien 2020, 2.2.4.1).
+    """Noise of the recordings in one condition (Chien 2020, 2.2.4.1).
 
-    distances_m: of the recordings. rmse_percent: root mean square over them of the error as a share of the depth.
-    subpixel: the same of the disparity error in pixels, None without a baseline. valid_share, gross_share: means.
+    distances_m: of the recordings. rmse_percent: their root mean square error as a share of the depth.
+    subpixel: the same for the disparity error in pixels, None without a baseline. valid_share, gross_share: means.
     grey: mean grey level, None if no image is known.
     """
 
@@ -85,11 +85,10 @@ class ConditionNoise:
 
 @dataclass(frozen=True)
 class NoiseCalibration:
-    """sigma(z) = s0 + s1 z + s2 z^2 in metres, and what it was fitted to, nearest first.
+    """sigma(z) = s0 + s1 z + s2 z^2 in metres, and the points it was fitted to, nearest first.
 
-    subpixel: s2 * focal length * baseline in pixels, None without a baseline. worst_percent: by how much the curve
-    misses a point at most. correlation_px: mean of the recordings'. conditions: in the order in which they were named,
-    empty if none was.
+    subpixel: s2 * focal length * baseline in pixels, None without a baseline. worst_percent: largest misfit of a point.
+    correlation_px: mean of the recordings'. conditions: in the order of the recordings, empty if none has a label.
     """
 
     s0: float
@@ -110,7 +109,7 @@ class NoiseCalibration:
 
     @property
     def worst_percent(self) -> float:
-        """Largest distance between the curve and a point, in percent of the point."""
+        """Largest misfit of the curve at a point, in percent of the point."""
         z, rmse = np.array([(point.distance_m, point.rmse_m) for point in self.points]).T
         return float(100 * np.max(np.abs(self.sigma(z) / rmse - 1)))
 
@@ -128,9 +127,9 @@ def calibrate_noise(
 ) -> NoiseCalibration:
     """Return the noise of the camera that took all recordings, fitted to the whole RMSE of single measurements.
 
-    The fixed part belongs into sigma as well: it does not average out where the camera stands, and where it moves the
-    map meets it as one more error of each measurement. `fitted` names those of s0, s1, s2 that need not be 0; each
-    needs a distance of its own.
+    The fixed part belongs in sigma too: it does not average out while the camera stands, and while it moves the map
+    sees it as one more error of each measurement. `fitted` names those of s0, s1, s2 that may differ from 0; each needs
+    its own distance.
     Raises StereovoxError: no wall, nothing in the region, different cameras, too few distances.
     """
     if not recordings:
@@ -154,7 +153,7 @@ def calibrate_noise(
 
 
 def by_condition(recordings: Sequence[WallRecording], points: Sequence[NoiseAt]) -> tuple[ConditionNoise, ...]:
-    """Return the noise in each condition named by the recordings, in their order; empty if none is named."""
+    """Return the noise in each labelled condition, in the recordings' order; empty if there is none."""
     named = list(dict.fromkeys(recording.condition for recording in recordings))
     return tuple(_condition(name, [p for p in points if p.condition == name]) for name in named) if any(named) else ()
 
@@ -177,9 +176,9 @@ def _condition(name: str, points: Sequence[NoiseAt]) -> ConditionNoise:
 
 
 def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> NoiseAt:
-    """Return the noise within `region` (width, height in metres on the wall) round the optical axis.
+    """Return the noise within `region` (width, height in metres on the wall) around the optical axis.
 
-    Raises StereovoxError if there is no wall or where too few pixels of the region have depth.
+    Raises StereovoxError if there is no wall or too few pixels of the region have depth.
     """
     camera = recording.camera
     wall = find_wall(recording.inverse, camera, recording.name)
@@ -189,7 +188,7 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
     if used.sum() < MIN_PIXELS:
         raise StereovoxError(
             f"{recording.name}: only {used.sum()} pixels of the middle {region[0]:g} x {region[1]:g} m show the wall; "
-            "clear what stands before it, give it more texture, or use a larger --region"
+            "clear the view of it, give it more texture, or use a larger --region"
         )
     plane = fit_plane(x[used], y[used], recording.inverse[used])
     rmse, temporal, fixed = _errors(recording.sums[:, used], 1 / (plane[0] + plane[1] * x[used] + plane[2] * y[used]))
@@ -217,7 +216,7 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
 
 
 def fit_noise(z: Array, rmse: Array, fitted: Sequence[str] = TERMS) -> tuple[float, float, float]:
-    """Return s0, s1, s2 >= 0 of the curve nearest to `rmse` (N,) at depths `z` (N,); those not in `fitted` are 0.
+    """Return s0, s1, s2 >= 0 of the curve nearest to `rmse` (N,) at depths `z` (N,); terms not in `fitted` are 0.
 
     Errors count as shares of the RMSE, because that is how precisely a standard deviation is known.
     """
@@ -233,7 +232,7 @@ def fit_noise(z: Array, rmse: Array, fitted: Sequence[str] = TERMS) -> tuple[flo
 def _errors(sums: NDArray[np.float64], wall_z: Array) -> tuple[float, float | None, float | None]:
     """Return RMSE, its temporal and its fixed part in metres, of pixels with `sums` (4, N) on a wall at `wall_z` (N,).
 
-    A pixel's variance from frame to frame is taken out of the error of its mean, or noise would pass for fixed error.
+    A pixel's temporal variance is subtracted from the error of its mean, or noise would count as fixed error.
     """
     count, _, first, second = sums
     mean = first / count

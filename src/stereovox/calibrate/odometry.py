@@ -14,24 +14,24 @@ from stereovox.errors import MissingExtra
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
 
 PLANE_REACH = 0.12
-"""Metres; points further apart do not belong together."""
+"""Metres; points farther apart do not correspond."""
 MIN_NORMAL_COSINE = 0.9
-"""Least cosine of the angle between two normals that belong together."""
+"""Least cosine of the angle between two corresponding normals."""
 INLIER_DISTANCE = 0.03
-"""Metres off the plane up to which a point has found its partner."""
+"""Metres off the plane up to which a point is an inlier."""
 STEPS = 10
 VARIETY = 0.02
 """Least share of normals along any axis: noise tilts those of a single wall, but by less."""
 FLOOR = (np.radians(0.03), 0.002)
-"""Errors that no count of points averages away (radians, metres)."""
+"""Errors that no number of points averages out (radians, metres)."""
 CELL = 0.08
 """Metres; points nearer to each other than this are merged."""
 REACH = 0.3
-"""Metres; points further apart do not belong together."""
+"""Metres; points farther apart do not correspond."""
 MIN_POINTS = 200
 """Fewest points of a usable image."""
 INLIERS = 0.55
-"""Share of the points that must find a partner."""
+"""Least share of inlier points."""
 NEW_REFERENCE = (np.radians(35), 0.6, 0.7)
 """The reference is replaced beyond this turn (radians) or travel (metres), or below this share of inliers."""
 WEAKEST = (np.radians(1.0), 0.05)
@@ -41,7 +41,7 @@ WEAKEST = (np.radians(1.0), 0.05)
 def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
     """Return the motion between images, given in order as time in nanoseconds and (M, 3) points in the optical frame.
 
-    An image that cannot be registered becomes the next reference itself, without a link to those before.
+    An image that cannot be registered becomes the next reference, without a link to earlier ones.
     Raises MissingExtra without small_gicp.
     """
     register = _Registration()
@@ -68,11 +68,11 @@ def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMo
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """How a camera moved between the images of a recording.
+    """Motion of a camera between the images of a recording.
 
-    stamps_ns: (N,) int64. reference: (N,) the number of the image that each was registered with, -1 for none.
-    T_reference_camera: (N, 4, 4), NaN without reference. covariance: (N, 6, 6) of the small motion (rotation vector,
-    then translation) by which it may be off, seen from the camera: T_true = T exp(error).
+    stamps_ns: (N,) int64. reference: (N,) the index of the image that each was registered with, -1 if none.
+    T_reference_camera: (N, 4, 4), NaN without reference. covariance: (N, 6, 6) of the small error motion (rotation
+    vector, then translation), seen from the camera: T_true = T exp(error).
     """
 
     stamps_ns: NDArray[np.int64]
@@ -82,7 +82,7 @@ class CameraMotion:
 
     @property
     def steps(self) -> NDArray[np.float64]:
-        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN if it is not known."""
+        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN if unknown."""
         T, reference = self.T_reference_camera, self.reference
         steps = np.full((max(len(T) - 1, 0), 4, 4), np.nan)
         for i in range(len(steps)):
@@ -95,10 +95,10 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """Where an image was taken: `T` (4, 4) in the frame of image number `reference` (-1: not known, `T` is NaN).
+    """The pose of an image: `T` (4, 4) in the frame of image `reference` (-1: unknown, `T` is NaN).
 
-    covariance: (6, 6) of the small motion (rotation vector, translation) by which it may be off, T_true = T exp(error).
-    share: of the image's points that lie on the reference's surfaces.
+    covariance: (6, 6) of the small error motion (rotation vector, translation), T_true = T exp(error).
+    share: inlier share of the image's points on the reference's surfaces.
     """
 
     reference: int = -1
@@ -116,16 +116,16 @@ class Surface:
 
     @classmethod
     def of(cls, cloud: Any) -> Surface:
-        """Return what a small_gicp cloud holds."""
+        """Return a small_gicp cloud's points and normals."""
         return cls(np.array(cloud.points())[:, :3], np.array(cloud.normals())[:, :3])
 
 
 def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
-    """Return the motion near `T` that moves the source onto the target's surfaces best.
+    """Return the motion near `T` that best registers the source to the target's surfaces.
 
     Iterated least squares of the distances d to the planes of the nearest points, weighted 1 / (1 + (d / s)^2) (Cauchy)
-    with s twice their usual size, so that what only one image sees has little say. `tree` finds points of `target`.
-    Surfaces that all look the same way let the other slide: such a link has no reference and share 0.
+    with s twice their usual size, so that surfaces in only one image have little weight. `tree` finds points of
+    `target`. If all surfaces face the same way the others can slide: such a link has no reference and share 0.
     """
     link = Link()
     for _ in range(STEPS):
@@ -146,13 +146,13 @@ def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
         T = T @ _motion(change)
         if np.abs(change).max() < 1e-5:
             break
-    return replace(link, T=orthonormalise(T))  # or the errors of rounding double from image to image
+    return replace(link, T=orthonormalise(T))  # or rounding errors double from image to image
 
 
 def _equations(
     T: Transform, source: Surface, target: Surface, tree: Any
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return J (M, 6) and distances (M,) for all points that have a partner.
+    """Return J (M, 6) and distances (M,) for all points with a partner.
 
     A small motion (w, v) of the source changes a distance to a plane by w . (p x n) + v . n, n seen from the source.
     """
@@ -169,7 +169,7 @@ def _equations(
 
 
 def _variety(normals: NDArray[np.float64]) -> float:
-    """Return the share of normals (N, 3) that look along the axis along which fewest do."""
+    """Return the share of normals (N, 3) along the axis that has fewest."""
     return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
 
 
@@ -200,7 +200,7 @@ class _Registration:
         return True
 
     def against(self, points: NDArray[np.float64], guess: Transform) -> Link | None:
-        """Return where the points' camera stood in the reference's frame; None if that is not certain enough."""
+        """Return the camera's pose in the reference's frame; None if it is too uncertain."""
         if len(points) < MIN_POINTS:
             return None
         cloud, _ = self._gicp.preprocess_points(points, CELL, num_neighbors=12)

@@ -8,9 +8,9 @@ Hand-eye calibration in closed form: A X = X B for motions A of the tracker, B o
 after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least squares of
 (R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
 
-Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and has no outlier
-rejection (`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of
-the motions wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
+Not cv2.calibrateHandEye: OpenCV 5 has none, and version 4's takes poses, not motions, and has no outlier rejection
+(`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of the motions
+wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from stereovox.opening import DepthSource
 from stereovox.sources.poses.poses import Poses
 
 MIN_TURN = np.radians(3.0)
-"""Fewest radians, root mean square, that the camera must turn between registered images."""
+"""Least root mean square turn of the camera between registered images, in radians."""
 MIN_SECOND_TURN = np.radians(1.2)
-"""The same about the second axis: rotation about one axis leaves the camera's place along it open."""
+"""The same about the second axis: rotation about one axis leaves the camera's position along it open."""
 COLUMNS = 106
-"""About how many blocks an image is wide: 8 pixels each for 848."""
+"""Approximate width of an image in blocks: 8 pixels each for 848."""
 SPREAD = 0.15
-"""Blocks whose inverse depths differ by more than this share of their mean lie across an edge."""
+"""Blocks whose inverse depths differ by more than this share of their mean are across an edge."""
 MIN_IMAGES = 20
 """Fewest registered images with trusted poses for a calibration."""
 MIN_REGISTERED = 0.5
-"""Share of the images that must be registered."""
+"""Least share of registered images."""
 MAX_RANGE = 5.0
 """Metres; depth beyond is too noisy to register."""
 UNIQUE, SAME_S = 2.0, 0.05
-"""A second offset (further away than SAME_S seconds) must fit so many times worse."""
+"""A second offset (farther away than SAME_S seconds) must fit this many times worse."""
 
 
 def calibrate_pair(
@@ -65,7 +65,7 @@ def calibrate_pair(
 ) -> PairCalibration:
     """Return extrinsics and clock offset of a depth camera and a tracker.
 
-    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
+    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are as in a
     `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
     Raises StereovoxError if motion or depth do not suffice or the recordings do not overlap;
     MissingExtra without small_gicp.
@@ -87,8 +87,8 @@ class PairCalibration:
     T_tracker_camera: (4, 4) metres, depth camera's optical frame to the tracker's body, both in optical axes.
     clock_offset_s: depth stamp = tracker stamp + offset, seconds.
     offset_std_s, rotation_std_deg (3,) about the camera's axes, translation_std_m (3,) along the tracker's: standard
-    deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
-    correlation: of the two angular speeds. images, registered, pairs: how many there were and how many counted.
+    deviations. rotation_residual_deg, translation_residual_m: median misfit of registered pairs of images.
+    correlation: of the two angular speeds. images, registered, pairs: the numbers of each.
     """
 
     T_tracker_camera: Transform
@@ -104,7 +104,7 @@ class PairCalibration:
     pairs: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the same with lists instead of arrays."""
+        """Return the fields with lists instead of arrays."""
         return {key: getattr(value, "tolist", lambda value=value: value)() for key, value in vars(self).items()}
 
 
@@ -112,8 +112,8 @@ def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
     """Return (N, 3) points up to depth `farthest`, one for each block of pixels that sees one smooth surface.
 
     The mean is taken over inverse depth: there a stereo camera's noise is even, and a plane is linear in the pixel.
-    A block counts when half of its pixels are VALID and their inverse depths lie close together. The image must reach
-    further than `farthest`: a limit on pixels would keep those that noise makes nearer, a shell that moves along.
+    A block counts if half of its pixels are VALID and their inverse depths are close together. The image must reach
+    farther than `farthest`: a limit on pixels would keep those that noise brings nearer, a shell that moves along.
     """
     n = max(1, round(image.camera.width / COLUMNS))
     valid = image.reason == Reason.VALID
@@ -134,7 +134,7 @@ def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
 
 
 def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
-    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size count as outliers."""
+    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size are outliers."""
     from scipy.spatial.transform import Rotation
 
     a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
@@ -174,7 +174,7 @@ def _blocks(image: NDArray, n: int) -> NDArray:
 
 
 def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tuple[Refined, float]:
-    """Return what fits best of all that the angular speeds allow; where a camera sits tells the false ones."""
+    """Return the best fit among the offsets that angular speeds allow; the mount exposes false ones."""
     tried = [(found, rough.correlation) for rough in offsets if (found := _refined(motion, track, rough.seconds))]
     if not tried:
         raise StereovoxError(f"poses: fewer than {MIN_IMAGES} images have trusted poses; record for longer, or slower")
@@ -197,7 +197,7 @@ def _refined(motion: CameraMotion, track: PoseTrack, offset: float) -> Refined |
 def _clouds(
     depth: DepthSource, progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield time and points of every image that can be used; the poses of the source do not count."""
+    """Yield time and points of every usable image; the source's poses are ignored."""
     config = load_config("default", max_range=2 * MAX_RANGE, **{"depth.denoise": False})  # registration wants it raw
     for frame in progress(depth, len(depth)) if progress else depth:
         try:

@@ -19,21 +19,21 @@ from stereovox.frame import AnyFrame, Frame, Reason, StereoFrame
 GROSS = 0.25
 """Values off by a larger share of the depth are not noise: mismatches, or a person walking through."""
 USUAL = 0.5
-"""A pixel counts if it has a value in this share of the frames; rarer ones are those that scatter in one direction."""
+"""A pixel counts if it has a value in this share of the frames; rarer ones scatter in one direction."""
 
 
 @dataclass(eq=False)
 class WallRecording:
-    """What the frames of one recording say about each pixel, without its gross errors.
+    """Sums over the frames of one recording for each pixel, without gross errors.
 
-    camera: its correction, if any, is in the numbers already. distance: where the optical axis meets the wall, as
+    camera: its correction, if any, is already applied. distance: where the optical axis meets the wall, as
     measured by hand, in metres, or None.
     sums (4, height, width) float64: number of values, then the sums of 1/z, z and z^2 (z in metres).
     gross: number of values left out as gross errors; skipped: frames without usable depth, first_fault: why the first
-    of them was. Poses do not count.
+    of them was. Poses are ignored.
     products: of the errors of 1/z of neighbouring pixels, see `add_products`, against the surface in the first frame.
     greys: mean grey level of the pixels with a value, of each frame whose image is known.
-    condition: in what light, with which emitter power or before which texture it was taken, in words.
+    condition: light, emitter power or texture, in words.
     """
 
     name: str
@@ -55,10 +55,10 @@ class WallRecording:
 
     @property
     def inverse(self) -> NDArray[np.float64]:
-        """Mean of 1/z in 1/m, (height, width), NaN where fewer than half the frames have a value.
+        """Mean of 1/z in 1/m, (height, width), NaN if fewer than half the frames have a value.
 
-        Not of z: a stereo camera's noise is even in disparity, which is proportional to 1/z; far away the mean of z is
-        too large.
+        Not of z: a stereo camera's noise is uniform in disparity, which is proportional to 1/z; far away the mean of z
+        is biased upwards.
         """
         enough = self.count >= max(1.0, USUAL * self.frames)
         return np.where(enough, self.sums[1] / np.maximum(self.count, 1), np.nan)
@@ -83,12 +83,12 @@ def read_wall(
     matched: Callable[[AnyFrame], Frame] = itself,
     condition: str = "",
 ) -> WallRecording:
-    """Return the sums over `frames`, which may lack poses; depths are corrected where `camera` has a correction.
+    """Return the sums over `frames`, which may lack poses; depths are corrected if `camera` has a correction.
 
     matched: turns stereo frames into depth frames. condition: see `WallRecording`.
 
-    The first frame tells where the wall is, and so what is a gross error.
-    Raises StereovoxError if not one frame has usable depth, and as `find_wall` if the first shows no wall.
+    The first frame gives the wall, and so defines gross errors.
+    Raises StereovoxError if no frame has usable depth, and as `find_wall` if the first shows no wall.
     """
     wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)), condition=condition)
     expected, gross = None, GROSS
@@ -112,7 +112,7 @@ def read_wall(
 
 
 def metres(frame: Frame) -> NDArray[np.float32]:
-    """Return the depth as measured in metres, float32, NaN if there is none; poses and corrections do not count."""
+    """Return the depth as measured in metres, float32, NaN if there is none; poses and corrections are ignored."""
     raw = np.asarray(frame.depth)
     depth_m = raw.astype(np.float32) * np.float32(frame.depth_scale)
     usable = np.isfinite(depth_m) & (depth_m > 0)

@@ -14,16 +14,16 @@ from stereovox.calibrate.tracker import PoseTrack
 from stereovox.geometry.se3 import Transform, rotation_matrix
 
 BLOCKS = 10
-"""Parts of the recording that are left out in turn, at most, to see how much the result depends on each."""
+"""Most parts of the recording left out in turn, to see how much the result depends on each."""
 STEPS = np.array([1e-2, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
-"""Steps of the derivatives: seconds (several poses, or their jitter passes for motion), radians, metres."""
+"""Steps of the derivatives: seconds (several poses, or their jitter looks like motion), radians, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """Registered pairs of images: times (N,) of both in seconds since the first image, and the camera's motion.
 
-    T_first_second: (N, 4, 4). whitening: (N, 6, 6), makes errors (rotation vector, translation) of equal weight.
+    T_first_second: (N, 4, 4). whitening: (N, 6, 6), gives errors (rotation vector, translation) equal weight.
     """
 
     first: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Pairs:
 class Refined:
     """Offset in seconds, X = T_tracker_camera, deviations (7,): s, 3 x rad, 3 x m; median residuals in rad and m.
 
-    misfit: median of the residuals in terms of the registrations' own standard deviations. pairs: number of them.
+    misfit: median of the residuals in the registrations' own standard deviations. pairs: number of them.
     """
 
     offset: float
@@ -49,7 +49,7 @@ class Refined:
 
 
 def usable_pairs(motion: CameraMotion, track: PoseTrack, offset: float) -> Pairs:
-    """Return the registered pairs for which the tracker can be trusted at both times, without a jump between them."""
+    """Return the registered pairs with a trusted tracker pose at both times, without a jump between them."""
     times = (motion.stamps_ns - motion.stamps_ns[0]) / 1e9
     second = np.flatnonzero(motion.reference >= 0)
     first = motion.reference[second]
@@ -65,10 +65,10 @@ def tracker_motion(pairs: Pairs, track: PoseTrack, offset: float) -> NDArray[np.
 
 
 def refine(pairs: Pairs, track: PoseTrack, offset: float, X: Transform) -> Refined:
-    """Return the offset and X near the given ones that make A(offset) X = X B fit best.
+    """Return the offset and X near the given ones that best fit A(offset) X = X B.
 
     Errors are weighted by the covariance of each registration and softened beyond three deviations (soft L1).
-    Deviations are those of a jackknife over contiguous parts of the recording, since errors of neighbouring images are
+    Deviations are by a jackknife over contiguous parts of the recording, because errors of neighbouring images are
     not independent.
     """
     from scipy.optimize import least_squares
@@ -81,7 +81,7 @@ def refine(pairs: Pairs, track: PoseTrack, offset: float, X: Transform) -> Refin
         return np.stack([(residuals(p + h) - residuals(p - h)) / (2 * h.sum()) for h in np.diag(STEPS)], axis=1)
 
     soft = 3 * max(1.4826 * float(np.median(np.abs(residuals(np.zeros(7))))), 1e-6)
-    given: Any = jacobian  # scipy's stubs know only the names of its own schemes
+    given: Any = jacobian  # scipy's stubs accept only the names of its own schemes
     found = least_squares(residuals, np.zeros(7), jac=given, loss="soft_l1", f_scale=soft, x_scale=STEPS)
     best_offset, best = offset + found.x[0], _turned(X, found.x[1:])
     errors = _errors(pairs, track, best_offset, best)
@@ -91,7 +91,7 @@ def refine(pairs: Pairs, track: PoseTrack, offset: float, X: Transform) -> Refin
 
 
 def _errors(pairs: Pairs, track: PoseTrack, offset: float, X: Transform) -> NDArray[np.float64]:
-    """Return (N, 6) by how much the tracker's motion, seen from the camera, misses the camera's own."""
+    """Return (N, 6) the error of the tracker's motion, seen from the camera, against the camera's own."""
     from scipy.spatial.transform import Rotation
 
     predicted = inverses(X[None]) @ tracker_motion(pairs, track, offset) @ X
@@ -112,7 +112,7 @@ def _deviations(
 ) -> NDArray[np.float64]:
     """Return standard deviations by a jackknife over parts in time, each with one Gauss-Newton step.
 
-    Pairs with one `reference` (N,) stay together, for its errors are common to them. scipy's J is weighted for soft L1,
+    Pairs with one `reference` (N,) stay together, because they share its errors. scipy's J is weighted for soft L1,
     its r is not: J^T r is the gradient once r has grown by (1 + (r / soft)^2)^(1/4).
     """
     r = r * (1 + (r / soft) ** 2) ** 0.25

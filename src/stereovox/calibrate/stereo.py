@@ -21,9 +21,9 @@ from stereovox.geometry.se3 import inverse
 MIN_PAIRS = 3
 """Fewest usable image pairs."""
 FAR_PX, FAR_TIMES = 0.5, 3.0
-"""A pair is dropped where its RMS is larger than this and than this many times the median of all pairs."""
+"""A pair is dropped if its RMS exceeds this and this many times the median of all pairs."""
 FOLDS = 6
-"""Parts of the pairs left out in turn, to see how well the rest predicts them."""
+"""Number of parts of the pairs left out in turn, to see how well the rest predicts them."""
 Names = tuple[str, Path, Path]
 Shown = Callable[[list[Names]], Iterable[Names]]
 Pixels = NDArray[np.float64]
@@ -33,10 +33,10 @@ Pixels = NDArray[np.float64]
 class BoardPair:
     """One pair of images.
 
-    left, right: (N, 2) pixels of the corners; None if no board was seen. why: the reason where it was dropped.
-    rms_px: root mean square of the distance from each corner to where calibration and board put it, both images.
-    epipolar_px: RMS difference of the rows of a corner in both images after rectification; unseen_px: the same, from a
-        calibration without this pair. NaN where it does not count.
+    left, right: (N, 2) pixels of the corners; None if no board was seen. why: the reason if it was dropped.
+    rms_px: root mean square reprojection error of the corners, both images.
+    epipolar_px: RMS difference of a corner's rows in both images after rectification; unseen_px: the same, from a
+        calibration without this pair. NaN if it does not count.
     """
 
     name: str
@@ -51,14 +51,14 @@ class BoardPair:
     unseen_px: float = np.nan
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is worth telling, with None for what is not known."""
+        """Return the reported values, None if unknown."""
         told = {key: _finite_or_none(getattr(self, key)) for key in ("rms_px", "epipolar_px", "unseen_px")}
         return {"name": self.name, "used": not self.why, "why": self.why, **told}
 
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """Both lenses, the right eye's extrinsics, and how well all pairs agree with them."""
+    """Both lenses, the right eye's extrinsics, and the agreement of all pairs with them."""
 
     eyes: Eyes
     board: Board
@@ -66,7 +66,7 @@ class StereoCalibration:
 
     @property
     def used(self) -> list[BoardPair]:
-        """The pairs that count."""
+        """The pairs used."""
         return [pair for pair in self.pairs if not pair.why]
 
     def overall(self, key: str) -> float:
@@ -86,9 +86,9 @@ class StereoCalibration:
 
 
 def calibrate_stereo(pairs: Iterable[BoardPair], board: Board, model: str = "pinhole") -> StereoCalibration:
-    """Return the calibration of `model` lenses from the corners of all pairs; those that do not fit are dropped.
+    """Return the calibration of `model` lenses from the corners of all pairs; pairs that do not fit are dropped.
 
-    Raises StereovoxError for an unknown model, or where fewer than three pairs are left.
+    Raises StereovoxError for an unknown model, or if fewer than three pairs are left.
     """
     check_model(model)
     pairs = list(pairs)
@@ -109,9 +109,9 @@ def check_model(model: str) -> None:
 
 
 def read_boards(folder: str | Path, board: Board, shown: Shown = iter) -> list[BoardPair]:
-    """Return the pairs of images in `folder` with their corners; those without are marked with the reason.
+    """Return the pairs of images in `folder` with their corners; pairs without are marked with the reason.
 
-    shown: is given the list of pairs and yields them one by one; it may tell a person how far they are.
+    shown: is given the list of pairs and yields them one by one; it may show progress.
     Raises StereovoxError if there is no pair at all.
     """
     pairs = [_with_corners(BoardPair(*names), board) for names in shown(image_pairs(folder))]
@@ -124,9 +124,9 @@ def read_boards(folder: str | Path, board: Board, shown: Shown = iter) -> list[B
 
 
 def epipolar_errors(eyes: Eyes, left: Pixels, right: Pixels) -> Pixels:
-    """Return by how many pixels (N,) the rows of points (N, 2) of both images differ after rectification.
+    """Return the row differences (N,) in pixels of points (N, 2) of both images after rectification.
 
-    Rows are those of a pinhole with the lenses' focal length; of fisheyes, even in angle, as those of wide cameras.
+    Rows are of a pinhole with the lenses' focal length; for fisheyes, uniform in angle, as for wide cameras.
     """
     focal = (eyes.left.fy + eyes.right.fy) / 2
     rays = [
@@ -141,7 +141,7 @@ def epipolar_errors(eyes: Eyes, left: Pixels, right: Pixels) -> Pixels:
 
 
 def field_of_view(lens: Lens) -> tuple[float, float]:
-    """Return the degrees that a lens sees across and down, through the middle, between the borders of its image."""
+    """Return a lens's field of view in degrees, horizontal and vertical, through the image's middle."""
     ends = [[-0.5, lens.cy], [lens.width - 0.5, lens.cy], [lens.cx, -0.5], [lens.cx, lens.height - 0.5]]
     off = np.degrees(np.nan_to_num(np.arccos(np.clip(lens.directions(ends)[:, 2], -1, 1)), nan=lens.widest))
     return float(off[0] + off[1]), float(off[2] + off[3])
@@ -203,7 +203,7 @@ def _drop_worst(pairs: Sequence[BoardPair]) -> bool:
 
 
 def _predict(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
-    """Tell of each pair how far its rows differ by a calibration that has not seen it."""
+    """Set each pair's row differences by a calibration without it."""
     if len(used) <= MIN_PAIRS:
         return
     left, right = _corners(used)

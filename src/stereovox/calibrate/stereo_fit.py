@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both lenses, the right eye's place and the boards' places from corners in images, by least squares in pixels.
+"""Both lenses, the right eye's pose and the boards' poses from corners in images, by least squares in pixels.
 
-Residuals are in pixels; all of it uses nothing of a lens but `Lens.project`, so both models are found in one way.
+Residuals are in pixels; only `Lens.project` is used of a lens, so both models are fitted alike.
 Rotations are vectors, axis times angle. Parameters of a lens: fx, fy, cx, cy, then its distortion.
 
-Not cv2.stereoCalibrate: it is as good on clean corners and quicker, but has no robust loss. With 2 % of the corners
-off by 5 px it misses the right eye by 1.4 mm and 0.33 deg (fisheye 0.8 mm, 0.09 deg), this by 0.23 mm and 0.05 deg
-(0.23 mm, 0.03 deg); cv2.fisheye.stereoCalibrate fails for 1 pair of lenses in 12, this for none
+Not cv2.stereoCalibrate: it is as good on clean corners and faster, but has no robust loss. With 2 % of the corners off
+by 5 px its error of the right eye is 1.4 mm and 0.33 deg (fisheye 0.8 mm, 0.09 deg), here 0.23 mm and 0.05 deg (0.23
+mm, 0.03 deg); cv2.fisheye.stereoCalibrate fails for 1 pair of lenses in 12, this for none
 (`benchmarks/calibrate_stereo.py`).
 """
 
@@ -24,14 +24,14 @@ from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 FULL_MODEL_VIEWS = 10
-"""Views from which on a fifth Brown-Conrady coefficient is fitted; with fewer it only follows noise."""
+"""Fewest views to fit a fifth Brown-Conrady coefficient; with fewer it only follows noise."""
 GUESSES = {"pinhole": np.geomspace(0.4, 4.0, 14), "fisheye": np.geomspace(0.25, 1.5, 14)}
-"""Focal lengths in widths of the image that are tried at the start."""
+"""Initial focal lengths tried, in image widths."""
 UNSEEN_PX = 1e3
 """Residual in pixels of a corner that the lens cannot see; it steers away from such lenses."""
 STEP = 1e-6
 MAX_STEPS, MIN_GAIN = 60, 1e-6
-"""The search ends after so many steps, or when one makes things better by so small a share."""
+"""The search ends after this many steps, or when one improves the cost by a smaller share."""
 Vector = NDArray[np.float64]
 Missed = Callable[[Vector, Vector], Vector]
 Corners = Sequence[NDArray[np.float64]]
@@ -40,14 +40,14 @@ Corners = Sequence[NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found: both lenses, the right eye's place, and T_left_board (4, 4) of each view."""
+    """The result: both lenses, the right eye's pose, and T_left_board (4, 4) of each view."""
 
     eyes: Eyes
     T_left_board: list[Transform]
 
 
 def fit_stereo(model: str, size: tuple[int, int], board: NDArray[np.float64], left: Corners, right: Corners) -> Fit:
-    """Return lenses of `model` and their places from the corners of one board in each view.
+    """Return lenses of `model` and their poses from the corners of one board in each view.
 
     size: width and height of the images. board: (N, 3) metres. Raises StereovoxError if nothing fits.
     """
@@ -67,7 +67,7 @@ def refined(
     left: Corners,
     right: Corners,
 ) -> Fit:
-    """Return what fits best to all corners of both eyes at once, beginning at what is given."""
+    """Return the best fit to all corners of both eyes at once, starting from the given values."""
     count = len(_numbers(lens_left))
 
     def parts(shared: Vector) -> tuple[Lens, Lens, Transform]:
@@ -102,7 +102,7 @@ def fit_lens(
 def _guess(
     model: str, size: tuple[int, int], board: NDArray[np.float64], corners: Corners
 ) -> tuple[Lens, list[Transform]]:
-    """Return the undistorted lens of all focal lengths tried that fits best, with the boards' places."""
+    """Return the best undistorted lens of all focal lengths tried, with the boards' poses."""
     best, found = np.inf, None
     count = 4 if model == "fisheye" or len(corners) < FULL_MODEL_VIEWS else 5
     for share in GUESSES[model]:
@@ -118,7 +118,7 @@ def _guess(
 
 
 def _place(lens: Lens, board: NDArray[np.float64], pixels: NDArray[np.float64]) -> Transform:
-    """Return about where the board stands (Zhang's homography between the board and the rays' slopes)."""
+    """Return the approximate pose of the board (Zhang's homography between the board and the rays' slopes)."""
     import cv2
 
     rays = lens.directions(pixels)
@@ -142,10 +142,10 @@ def missed_pixels(lens: Lens, T: Sequence[Transform], board: NDArray[np.float64]
 
 
 def _least_squares(missed: Missed, shared: Vector, places: Vector) -> tuple[Vector, Vector]:
-    """Return the `shared` numbers and the (views, 6) `places` for which `missed` (views, residuals) is smallest.
+    """Return the `shared` numbers and the (views, 6) `places` that minimise `missed` (views, residuals).
 
-    Steps of Levenberg and Marquardt. Residuals far above a pixel count by their size, not its square, so that a view
-    that does not belong here does not bend the others.
+    Levenberg-Marquardt steps. Residuals far above a pixel count linearly, not squared, so that an outlier view does not
+    bend the others.
     """
     damping, residuals = 1e-3, missed(shared, places)
     for _ in range(MAX_STEPS):
@@ -170,7 +170,7 @@ def _least_squares(missed: Missed, shared: Vector, places: Vector) -> tuple[Vect
 def _rates(missed: Missed, shared: Vector, places: Vector, here: Vector) -> Vector:
     """Return the (views * residuals, parameters) derivatives by differences.
 
-    A view's residuals depend on its own place only, so one step of all places at once gives a column of each.
+    A view's residuals depend only on its own pose, so one step of all poses at once gives a column of each.
     """
     count, views = len(shared), len(places)
     J = np.zeros((*here.shape, count + 6 * views))

@@ -18,24 +18,24 @@ from stereovox.errors import StereovoxError
 Array = NDArray[np.float64]
 TERMS = 6
 MIN_VALID = 0.3
-"""Share of the pixels that must have depth."""
+"""Least share of pixels with depth."""
 MIN_WALL = 0.6
-"""Share of the pixels with depth that must lie on the wall."""
+"""Least share of the pixels with depth on the wall."""
 TOLERANCE = 0.03
-"""Share of the depth by which a pixel of the wall may lie off the quadratic; four times the noise if that is more."""
+"""Largest deviation of a wall pixel from the quadratic, as a share of depth; four times the noise if larger."""
 NOISIEST = 0.15
-"""Noise, as a share of the depth, above which nothing can be told from an image."""
+"""Noise, as a share of the depth, above which an image is unusable."""
 STEEPEST_DEG = 20.0
 """A wall that leans more is refused."""
 MAX_CURVED = 0.4
-"""Largest distortion, as a share of the depth, that is believed."""
+"""Largest plausible distortion, as a share of the depth."""
 BLOCKS = 40
 GUESSES = 400
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """The wall in an image: 1/z = coefficients . terms(x, y) in 1/m, and which pixels (height, width) lie on it.
+    """The wall in an image: 1/z = coefficients . terms(x, y) in 1/m, and which pixels (height, width) are on it.
 
     noise: standard deviation from pixel to pixel as a share of the depth.
     """
@@ -79,8 +79,8 @@ def tilt_deg(plane: Array) -> float:
 def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
     """Return the wall that fills most of an image of 1/z (height, width, NaN: no value).
 
-    Raises StereovoxError, one line that begins with `name`: too few pixels with depth or too scattered ones, no surface
-    that is nearly flat, too tilted, too curved.
+    Raises StereovoxError, one line that begins with `name`: too few or too scattered pixels with depth, no surface
+    that is nearly flat, too much tilt, too much curvature.
     """
     valid = np.isfinite(inverse)
     if valid.mean() < MIN_VALID:
@@ -107,7 +107,7 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
 def fit_plane(x: Array, y: Array, inverse: Array, distance: float | None = None, square: bool = False) -> Array:
     """Return (a, b, c) of the plane 1/z = a + b x + c y through points (N,), each weighted by its depth.
 
-    distance: where the optical axis meets the plane in metres, if that is known; square: the plane is perpendicular to
+    distance: where the optical axis meets the plane in metres, if known; square: the plane is perpendicular to
     the axis.
     """
     columns = np.stack([np.ones_like(x), x, y], axis=1)
@@ -128,7 +128,7 @@ def _noise(inverse: Array) -> float:
 
 
 def _guess(x: Array, y: Array, inverse: Array, tolerance: float, name: str) -> Array:
-    """Return the quadratic through six blocks of pixels on which most other blocks lie."""
+    """Return the quadratic through six blocks of pixels that most other blocks fit."""
     u, v, m = _blocks(x), _blocks(y), _blocks(inverse)
     known = np.isfinite(m)
     if known.sum() < TERMS:
@@ -149,7 +149,7 @@ def _guess(x: Array, y: Array, inverse: Array, tolerance: float, name: str) -> A
 
 
 def _blocks(image: Array) -> Array:
-    """Return the medians of blocks of pixels, about 40 across; noise and stray pixels are gone. NaN: none has depth."""
+    """Return the medians of blocks of pixels, about 40 across; without noise and stray pixels. NaN: none has depth."""
     n = max(1, image.shape[1] // BLOCKS)
     rows, columns = image.shape[0] // n, image.shape[1] // n
     blocks = image[: rows * n, : columns * n].reshape(rows, n, columns, n).swapaxes(1, 2).reshape(rows, columns, n * n)
@@ -178,7 +178,7 @@ def _check(wall: Wall, surface: Array, plane: Array, share: float, name: str) ->
         )
     if wall.tilt_deg > STEEPEST_DEG:
         raise StereovoxError(
-            f"{name}: the wall leans by {wall.tilt_deg:.0f} deg, more than {STEEPEST_DEG:.0f}; look at it squarely"
+            f"{name}: the wall leans by {wall.tilt_deg:.0f} deg, more than {STEEPEST_DEG:.0f}; face it squarely"
         )
     curved = np.abs(surface / plane - 1)[wall.on_wall].max()
     if curved > MAX_CURVED:

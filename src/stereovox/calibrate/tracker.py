@@ -14,27 +14,26 @@ from stereovox.sources.poses.poses import MAX_GAP_NS, Poses
 from stereovox.sources.poses.tracker import angles, jumps
 
 SMOOTH = 0.03
-"""Seconds; a hand that swings twice a second loses 0.6 % of its turns by that."""
+"""Smoothing in seconds; a hand that swings twice a second loses 0.6 % of its turns."""
 STEP = 0.01
-"""Seconds between the samples that are compared."""
+"""Seconds between compared samples."""
 OVERLAP = 0.5
-"""Share of the shorter recording that must lie within the other."""
+"""Least share of the shorter recording within the other."""
 MIN_CORRELATION = 0.6
 """Least correlation of a match."""
 RIVAL_GAP_S, RIVAL_SHARE, MAX_RIVALS = 0.3, 0.85, 5
-"""Rival matches that are tried as well: this many seconds away from better ones, this well correlated (share of the
-best), at most this many.
-"""
+"""Rival matches that are also tried: at least this many seconds from better ones, with this share of the best
+correlation, at most this many."""
 MAX_SPAN_S = 86_400.0
-"""Seconds; a longer recording has a wrong stamp, and its samples would fill the memory."""
+"""Seconds; a longer recording has a wrong stamp, and its samples would fill memory."""
 
 
 class PoseTrack:
     """Poses interpolated as `Poses.at` does, vectorised; times in seconds since `start_ns`.
 
-    Poses below `min_confidence` and those that cannot be used are left out; a jump divides the track. A tracker's poses
-    tremble from one to the next, by which no offset finer than their distance could be found, so each is the mean of
-    those within `SMOOTH` around it.
+    Poses below `min_confidence` and unusable ones are left out; a jump divides the track. A tracker's poses jitter,
+    which would limit the offset to their spacing, so each is the mean of those within `SMOOTH` around it.
+
     """
 
     def __init__(self, poses: Poses, min_confidence: float, max_speed_mps: float, max_turn_dps: float):
@@ -58,7 +57,7 @@ class PoseTrack:
         self._rotations = Slerp(self.times, Rotation.from_quat(_averages(_quaternions(kept), count)))
 
     def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (N, 4, 4) T_world_body at (N,) times; those beyond either end get the pose at that end."""
+        """Return (N, 4, 4) T_world_body at (N,) times; times beyond either end get the pose at that end."""
         times = np.clip(times, self.times[0], self.times[-1])
         T = np.zeros((len(times), 4, 4))
         T[:, 3, 3] = 1
@@ -67,7 +66,7 @@ class PoseTrack:
         return T
 
     def parts(self, times: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return for (N,) times which part of the track between two jumps they lie in; -1 where no pose is near."""
+        """Return, for (N,) times, the part of the track between two jumps; -1 if no pose is near."""
         after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         before = after - 1
         gap = np.maximum(times - self.times[before], self.times[after] - times)
@@ -84,7 +83,7 @@ class Offset:
 
 
 def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, float] | None = None) -> list[Offset]:
-    """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
+    """Return the offsets at which the two angular speeds match, best first; one, unless the motion repeats.
 
     Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
     this range, in seconds. Raises StereovoxError if no offset fits.
@@ -113,7 +112,7 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
 
 
 def _poses_to_average(times: NDArray[np.float64]) -> int:
-    """Return the odd number of poses that SMOOTH holds; one where they come too slowly or there are too few."""
+    """Return the odd number of poses within SMOOTH; one if they are too sparse or too few."""
     count = int(SMOOTH / np.median(np.diff(times))) // 2 * 2 + 1
     return count if len(times) > 2 * count else 1
 
@@ -143,7 +142,7 @@ def _frame_time(motion: CameraMotion) -> float:
 
 
 def _camera_speed(motion: CameraMotion) -> NDArray[np.float64]:
-    """Return the angular speed in rad/s each STEP from the first image on, NaN if it is not known."""
+    """Return the angular speed in rad/s each STEP from the first image on, NaN if unknown."""
     times = (motion.stamps_ns - motion.stamps_ns[0]) / 1e9
     spans = np.diff(times)
     usual = (spans > 0) & (spans <= max(0.25, 3 * np.median(spans)))
@@ -153,7 +152,7 @@ def _camera_speed(motion: CameraMotion) -> NDArray[np.float64]:
 
 
 def _track_speed(track: PoseTrack, window: float) -> NDArray[np.float64]:
-    """Return the angular speed in rad/s each STEP from the first pose on, as a camera of this frame time sees it."""
+    """Return the angular speed in rad/s each STEP from the first pose on, as seen by a camera with this frame time."""
     samples = np.arange(0, track.times[-1], STEP)
     before, after = samples - window / 2, samples + window / 2
     turned = np.swapaxes(track.at(before)[:, :3, :3], 1, 2) @ track.at(after)[:, :3, :3]
@@ -165,7 +164,7 @@ def _track_speed(track: PoseTrack, window: float) -> NDArray[np.float64]:
 def _correlate(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return lags and Pearson's correlation between a[i + lag] and b[i] over the samples both know.
 
-    NaN where fewer samples than OVERLAP of the shorter one are common, or where one of them does not change.
+    NaN if fewer samples than OVERLAP of the shorter one are common, or one of them is constant.
     """
     from scipy.signal import correlate, correlation_lags
 
@@ -187,7 +186,7 @@ def _correlate(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[
 
 
 def _peak(values: NDArray[np.float64], k: int) -> float:
-    """Return how far next to sample `k` the top of the parabola through it and its neighbours lies, in samples."""
+    """Return the offset, in samples, from sample `k` to the peak of the parabola through it and its neighbours."""
     if not 0 < k < len(values) - 1:
         return 0.0
     left, middle, right = values[k - 1 : k + 2]

@@ -27,9 +27,9 @@ from stereovox.errors import StereovoxError, did_you_mean
 SIMPLEST_FIRST = ("scale", "disparity", "scale+disparity")
 MODELS = ("auto", *SIMPLEST_FIRST, "thesis")
 SAMPLES = 20_000
-"""Pixels of each wall that are fitted; its figures are of all."""
+"""Pixels of each wall that are fitted; its figures use all."""
 MAX_DISTANCE_ERROR = 0.2
-"""A measured distance that differs from the camera's by a larger share belongs to another wall."""
+"""A measured distance that differs more from the camera's, as a share, belongs to another wall."""
 SAME_DISTANCE = 1.1
 """Distances whose ratio is smaller count as one."""
 SIMPLER_FACTOR = 1.1
@@ -48,10 +48,10 @@ def calibrate_wall(
 ) -> WallCalibration:
     """Return the correction that makes the recorded walls flat.
 
-    model: of `DepthCorrection`, or `auto`: the one that does best at distances it was not fitted to; with a single
-    distance `scale`, whose error stays the same share of the depth wherever it is used. square: the walls are known to
-    stand perpendicular to the optical axis. check: walls that are only looked at afterwards.
-    Raises StereovoxError: no wall, distances for some of the walls only or that cannot be, another camera,
+    model: of `DepthCorrection`, or `auto`: the best at distances it was not fitted to; with a single distance `scale`,
+    whose error stays the same share of the depth everywhere. square: the walls are known to be perpendicular to the
+    optical axis. check: walls used only for checking.
+    Raises StereovoxError: no wall, distances of only some walls or impossible ones, another camera,
     an unknown model.
     """
     check_model(model)
@@ -77,10 +77,10 @@ def calibrate_wall(
 
 @dataclass(frozen=True, eq=False)
 class WallCalibration:
-    """The camera with its correction, how the model was chosen, and what it does to each wall.
+    """The camera with its correction, the reason for the model, and its effect on each wall.
 
-    scores: for each model its error in percent on the walls it was fitted to (`fit`), and, where there are several
-    distances, on those left out in turn (`unseen`), infinite where it leaves no depth there.
+    scores: for each model its error in percent on the walls it was fitted to (`fit`), and, with several
+    distances, on those left out in turn (`unseen`), infinite if it leaves no depth there.
     """
 
     camera: PinholeCamera
@@ -91,7 +91,7 @@ class WallCalibration:
 
     @property
     def correction(self) -> DepthCorrection:
-        """The correction that was found."""
+        """The correction found."""
         assert self.camera.correction
         return self.camera.correction
 
@@ -113,7 +113,7 @@ class WallResult:
 
     before, after: (height, width) of (z - z_wall) / z_wall, mean over the frames, NaN off the wall. points_before,
     points_after: (height, width, 3) metres in the optical frame. plane: (a, b, c) of the wall, 1/z = a + b x + c y.
-    fitted: False for a wall that was only looked at afterwards.
+    fitted: False for a wall used only for checking.
     """
 
     recording: WallRecording
@@ -147,13 +147,13 @@ class WallResult:
 
 
 def check_model(model: str) -> None:
-    """Raise StereovoxError for a model that does not exist."""
+    """Raise StereovoxError for an unknown model."""
     if model not in MODELS:
         raise StereovoxError(f"unknown model '{model}'{did_you_mean(model, MODELS)}")
 
 
 def distance_groups(distances: Sequence[float]) -> list[int]:
-    """Return for each distance the number of its group; distances within a tenth of the group's least are one group."""
+    """Return the group of each distance; distances within a tenth of the group's least belong together."""
     groups, starts = [0] * len(distances), []
     for i in np.argsort(distances):
         if not starts or distances[i] > SAME_DISTANCE * starts[-1]:
@@ -163,9 +163,9 @@ def distance_groups(distances: Sequence[float]) -> list[int]:
 
 
 def fit(model: str, walls: Sequence[Points]) -> DepthCorrection:
-    """Return the correction of this model that makes the walls as flat as can be, in shares of their depth.
+    """Return the correction of this model that makes the walls as flat as possible, in shares of their depth.
 
-    Either all walls have a distance or none.
+    Either all walls have a distance, or none has.
     """
     if model == "thesis":
         return _fit_thesis(walls)
@@ -182,7 +182,7 @@ def fit(model: str, walls: Sequence[Points]) -> DepthCorrection:
 class Points:
     """Pixels of one wall: slopes x, y and measured 1/z in 1/m, each (N,).
 
-    distance: where the optical axis meets the wall in metres, None: not known. square: the wall is known to stand
+    distance: where the optical axis meets the wall in metres, None: unknown. square: the wall is known to be
     perpendicular to the axis.
     """
 
@@ -194,7 +194,7 @@ class Points:
 
 
 def corrected_inverse(correction: DepthCorrection | None, x: Array, y: Array, inverse: Array) -> Array:
-    """Return the corrected 1/z (N,) in 1/m; NaN where the correction leads to no depth."""
+    """Return the corrected 1/z (N,) in 1/m; NaN if the correction gives no depth."""
     if correction is None:
         return inverse
     if correction.model == "thesis":
@@ -216,13 +216,13 @@ def plane_of(wall: Points, correction: DepthCorrection | None = None) -> Array:
 
 
 def residual(wall: Points, correction: DepthCorrection | None, plane: Array | None = None) -> Array:
-    """Return (z - z_plane) / z_plane of the corrected points (N,); without `plane` that of `plane_of`."""
+    """Return (z - z_plane) / z_plane of the corrected points (N,); without `plane`, the plane of `plane_of`."""
     a, b, c = plane_of(wall, correction) if plane is None else plane
     return (a + b * wall.x + c * wall.y) / corrected_inverse(correction, wall.x, wall.y, wall.inverse) - 1
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square of what is not NaN; infinite if nothing is left."""
+    """Return the root mean square of non-NaN values; infinite if there are none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("inf")
 
@@ -255,7 +255,7 @@ def _equations(model: str, walls: Sequence[Points], active: np.ndarray, count: i
 def _fit_thesis(walls: Sequence[Points]) -> DepthCorrection:
     """Return the quadratic in X of Chien 2020, Eq A.1 and A.2: dZ = p1 X^2 + p2 X + p3, X in metres.
 
-    His wall is square and at a measured distance; else p2 or p3 stays zero, see the top of this file.
+    Chien's wall is square and at a measured distance; else p2 or p3 stays zero, see the top of this file.
     """
     straight = fit("scale", walls)
     columns, errors = [], []

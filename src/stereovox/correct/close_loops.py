@@ -36,20 +36,19 @@ from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS, Trajectory, w
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """What loop closure found and did.
+    """The result of loop closure.
 
     Attributes:
         stamps_ns: (N,) int64, times of the map's frames in order.
-        T_world_before: (N, 4, 4) float64, their poses as they came.
+        T_world_before: (N, 4, 4) float64, their original poses.
         T_world_sensor: (N, 4, 4) float64, their poses with all loops closed.
-        loops: The loops that were closed; `first` and `second` are numbers of `places`.
-        refused: Places that look the same and were not believed to be, and why.
-        anchors: (S,) int64, numbers of the frames in the middle of all places.
-        report: What the correction did to the map.
-        odometry: The second odometry, and for how many steps it was of use; None if missing.
-        positions: The positions that do not drift, and in how many places they are agreed with; None if there are
-            none.
-        sensors: Which sensor took each of the N frames; empty if there is but one.
+        loops: The loops that were closed; `first` and `second` are indices of `places`.
+        refused: Places that look the same but were rejected, and why.
+        anchors: (S,) int64, indices of the frames in the middle of all places.
+        report: Report of the map's correction.
+        odometry: The second odometry, and the number of steps it helped; None if missing.
+        positions: The drift-free positions, and the number of places that agree with them; None if there are none.
+        sensors: Sensor of each of the N frames; empty if there is only one.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -65,7 +64,7 @@ class LoopClosure:
 
     @property
     def moved_m(self) -> NDArray[np.float64]:
-        """Return by how many metres (N,) each frame moved."""
+        """Return the distance (N,) in metres that each frame moved."""
         return np.linalg.norm(self.T_world_sensor[:, :3, 3] - self.T_world_before[:, :3, 3], axis=1)
 
     @property
@@ -75,7 +74,7 @@ class LoopClosure:
 
     @property
     def lines(self) -> LoopLines:
-        """Return the closed and the refused loops as lines between their places, as the map remembers them."""
+        """Return the closed and the refused loops as lines between their places, as stored in the map."""
         return LoopLines.between(*(self.ends(found, self.T_world_sensor) for found in (self.loops, self.refused)))
 
     def ends(self, loops: Sequence[Loop], poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -93,14 +92,14 @@ class LoopClosure:
     def save(self, path: str | Path) -> None:
         """Write the corrected poses as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.
 
-        Of several sensors those of the one that took the first frame: a file is the way of one.
+        With several sensors, only the poses of the first frame's sensor: a file is one trajectory.
 
         Args:
             path: The file, `.tum` or `.txt`.
 
         Raises:
             StereovoxError: Another ending.
-            MapFileError: It cannot be written; an older one is then still there.
+            MapFileError: It cannot be written; an older file is then kept.
         """
         file = check_file(str(path), TRAJECTORY_ENDINGS)
         own = np.array([sensor == self.sensors[0] for sensor in self.sensors] or [True] * len(self.stamps_ns))
@@ -108,7 +107,7 @@ class LoopClosure:
         write_trajectory(file, self.stamps_ns[own].tolist(), self.T_world_sensor[own], camera)
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `stereovox loops --json`, besides those of the map."""
+        """Return the numbers of `stereovox loops --json`, except the map's."""
         offs = [loop.off_m for loop in self.loops]
         return {
             "loops": len(self.loops),
@@ -132,7 +131,7 @@ class ClosedMap:
     Attributes:
         map: The map with its loops closed, as saved.
         out: Where it was saved.
-        closure: What was found and done.
+        closure: The loops found and the correction.
     """
 
     map: VoxelMap
@@ -150,30 +149,30 @@ def close_loops(
     progress: Progress = no_progress,
     **overrides: Any,
 ) -> ClosedMap:
-    """Find the loops of a saved map, bend the way of its camera so that they close, and save the map that this makes.
+    """Find the loops of a saved map, correct its camera's trajectory so that they close, and save the resulting map.
 
-    Places are compared by their surfaces. A loop is believed where these fit at one place only within what the poses'
+    Places are compared by their surfaces. A loop is accepted if these fit at only one place within what the poses'
     drift allows, and another finding agrees.
 
     Args:
         path: Folder of a map that kept its frames (`map.keep_frames`).
         out: Folder of the new map.
-        positions: Positions of the camera that do not drift, as of a GNSS receiver: a file of lines `stamp tx ty tz qx
-            qy qz qw` (TUM; rotations are not used) in metres, in any world with the same way up, or a bag with
-            `sensor_msgs/NavSatFix` (where there are several topics: `drive.bag?topic=/gps/fix`).
+        positions: Drift-free positions of the camera, as of a GNSS receiver: a file of lines `stamp tx ty tz qx
+            qy qz qw` (TUM; rotations are not used) in metres, in any world with the same up direction, or a bag with
+            `sensor_msgs/NavSatFix` (if there are several topics: `drive.bag?topic=/gps/fix`).
         positions_sigma: Their standard deviation in metres, along each axis.
-        odometry: A second odometry next to the map's poses, such as that of wheels: a file of such lines (TUM) with the
-            poses of the camera in any world; `loops.odometry_drift` says how far it drifts.
-        progress: Called with how many are done, how many there are, and what is being done.
+        odometry: A second odometry next to the map's poses, such as wheel odometry: a file of such lines (TUM) with
+            poses of the camera in any world; `loops.odometry_drift` gives its drift.
+        progress: Called with the number done, the total, and the current activity.
         **overrides: Settings of `loops`, such as `**{"loops.drift": 0.05}` for poses that drift more than usual.
 
     Returns:
-        The new map, and what was found and done. Where nothing was found it is a copy.
+        The new map and the closure. If no loop was found the map is a copy.
 
     Raises:
         StereovoxError: One line: the map cannot be read, or did not keep its frames; `positions` cannot be read, are
-            too few or too close to each other, or contradict the way; `odometry` cannot be read, has no poses at the
-            map's times, or contradicts it.
+            too few or too close to each other, or contradict the trajectory; `odometry` cannot be read, has no poses at
+            the map's times, or contradicts it.
         MissingExtra: gtsam is not installed.
     """
     refuse_without_frames(overrides)
@@ -192,7 +191,7 @@ def close_loops(
 
 
 def refuse_without_frames(overrides: Mapping[str, Any]) -> None:
-    """Raise StereovoxError if settings say that no frames are kept."""
+    """Raise StereovoxError if the settings keep no frames."""
     if overrides.get("map.keep_frames") is False:
         raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
 
@@ -215,22 +214,22 @@ def close(
     positions: Positions | None = None,
     odometry: Odometry | None = None,
 ) -> LoopClosure:
-    """Find the loops of the map that a mapper makes, and correct it. Frames that other threads add while loops are
-    sought move as the last one; those that they add while the map is corrected stay where they are.
+    """Find the loops of a mapper's map, and correct it. Frames that other threads add during the search move like the
+    last one; frames that they add during the correction stay unchanged.
 
     Args:
         mapper: Its map must keep its frames (`map.keep_frames`).
-        progress: Called with how many are done, how many there are, and what is being done.
-        positions: Positions of the camera that do not drift.
+        progress: Called with the number done, the total, and the current activity.
+        positions: Drift-free positions of the camera.
         odometry: A second odometry next to the frames' poses.
 
     Returns:
-        What was found and done.
+        The loops found and the correction.
 
     Raises:
-        StereovoxError: The map did not keep its frames, or was merged of several recordings; `positions` are too few
-            or too close to each other, or contradict the way; `odometry` has no poses at the times of the frames, or
-            contradicts it.
+        StereovoxError: The map did not keep its frames, or was merged from several recordings; `positions` are too few
+            or too close to each other, or contradict the trajectory; `odometry` has no poses at the times of the
+            frames, or contradicts it.
         MissingExtra: gtsam is not installed.
     """
     kept = need_frames(mapper.map.kept_frames, "the map")
@@ -241,7 +240,7 @@ def close(
     for done, frame in enumerate(frames, 1):
         closer.add(frame)
         progress(done, len(frames), "looking for loops")
-    closer.finish(lambda done, total: progress(done, total, "laying places onto each other"), positions)
+    closer.finish(lambda done, total: progress(done, total, "registering places"), positions)
     if positions is not None:
         positions.check_used()
     if odometry is not None:
@@ -250,7 +249,7 @@ def close(
     later = {
         (one.sensor, one.stamp_ns): closer.submaps[-1].bend @ one.T_world_sensor
         for one in kept.frames
-        if one.number > frames[-1].number  # some of `frames` may have been dropped since, for a budget
+        if one.number > frames[-1].number  # a budget may have dropped some of `frames` since
     }
     report = mapper.correct(corrected | later) if closer.loops or known else CorrectionReport()
     closure = LoopClosure(
@@ -271,6 +270,6 @@ def close(
 
 
 def _anchors(submaps: Sequence[Submap]) -> NDArray[np.int64]:
-    """Return the numbers (S,) of the anchors of submaps among the frames of all."""
+    """Return the indices (S,) of the submaps' anchors among all frames."""
     before = np.cumsum([0, *(len(submap.frames) for submap in submaps)])[:-1]
     return before + np.array([submap.anchor for submap in submaps], np.int64)

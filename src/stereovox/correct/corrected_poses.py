@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the frames of a map belong, by what another program found out later: a path of better poses, or a jump of
+"""Corrected poses of a map's frames, from what another program found later: a path of better poses, or a jump of
 odometry's frame in the map."""
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from stereovox.maps.record.kept_frames import KeptFrame
 from stereovox.sources.poses.poses import MAX_GAP_NS, Poses
 
 SAME_NS = 500_000
-"""A pose whose stamp is this close to a frame's is its own: some programs write milliseconds."""
+"""A pose whose stamp is this close to a frame's belongs to it: some programs write milliseconds."""
 SLIGHT = 0.1
-"""Share of a cell: frames that would move less stay where they are."""
+"""Share of a cell: frames that would move less are left alone."""
 SETTLED = 0.5
-"""Share of a cell by which what is in view may move with odometry's frame, from one image to the next, after a jump."""
+"""Share of a cell by which the view may move with odometry's frame between images once a jump is over."""
 METRES_PER_RADIAN = 0.5
-"""How much of a way a turn on the spot counts for."""
+"""Metres of path that a radian of turn counts as."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class CorrectedPoses:
 
     Attributes:
         poses: T_world_sensor (4, 4) by sensor and stamp in nanoseconds, for `Mapper.correct`.
-        posed: Number of frames that have a pose of their own.
-        between: Number of frames between them, which move as their neighbours before and after.
-        outside: Number of frames before the first or after the last of them; they stay where they are.
+        posed: Number of frames with their own pose.
+        between: Number of frames between them, which move like their neighbours.
+        outside: Number of frames before the first or after the last of them; they are not moved.
     """
 
     poses: Mapping[FrameKey, Transform]
@@ -48,14 +48,14 @@ class CorrectedPoses:
 
 
 class _Anchor(NamedTuple):
-    """How the world's poses at a time move: T_new_old (4, 4), from where they were to where they belong."""
+    """The motion of the world's poses at a time: T_new_old (4, 4), from old to corrected poses."""
 
     stamp_ns: int
     T_new_old: Transform
 
 
 def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
-    """Return a saved map and the frames it kept. Raises StereovoxError, which names the cure, where it kept none."""
+    """Return a saved map and the frames it kept. Raises StereovoxError, which names the cure, if it kept none."""
     saved = load_map(path)
     if isinstance(saved, BoxedMap):
         cure = "name better poses after the recording in the fleet's list, and go on with --resume"
@@ -64,13 +64,13 @@ def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
 
 
 def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str, Transform]) -> CorrectedPoses:
-    """Find out where frames belong by a path of corrected poses, such as the key poses of a pose graph.
+    """Return frame poses from a path of corrected poses, such as the key poses of a pose graph.
 
-    A frame has the nearest pose whose stamp is within half a millisecond of its own. Where frames come rarely and
-    poses often, it is interpolated between two, each less than 0.1 s away. Poses that belong to no frame are compared
-    with where the frames around them, each less than 0.1 s away, say that the body was. All other frames, also those
-    of sensors without a mount, are moved as what is known before and after them: the way that both would move them,
-    interpolated in time.
+    A frame takes the nearest pose whose stamp is within half a millisecond of its own. If frames are sparse and poses
+    dense, it is interpolated between two, each less than 0.1 s away. Poses that belong to no frame are compared with
+    the body's pose by the frames around them, each less than 0.1 s away. All other frames, also those of sensors
+    without a mount, move like their neighbours in time before and after, interpolated between both.
+
 
     Args:
         frames: Kept frames of a map (`VoxelMap.kept_frames`), in any order.
@@ -78,10 +78,10 @@ def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str,
         mounts: T_body_sensor (4, 4) by the name of the sensor.
 
     Returns:
-        Poses of all frames that are known to move. Empty, where no pose of the path is near a frame with a mount.
+        New poses of all frames that move. Empty if no pose of the path is near a frame with a mount.
 
     Raises:
-        FrameRefused: The very pose of a frame cannot be used, such as a damaged line of a file.
+        FrameRefused: A frame's own pose is unusable, such as a damaged line of a file.
     """
     frames = sorted(frames, key=lambda frame: frame.stamp_ns)
     new, anchors = dict[FrameKey, Transform](), list[_Anchor]()
@@ -99,13 +99,13 @@ def poses_by_path(frames: Iterable[KeptFrame], path: Poses, mounts: Mapping[str,
 def noticeable(
     frames: Iterable[KeptFrame], poses: Mapping[FrameKey, Transform], least_m: float, reach_m: float
 ) -> dict[FrameKey, Transform]:
-    """Return the poses by which something that a frame sees moves.
+    """Return the poses that noticeably move something in a frame's view.
 
     Args:
         frames: Kept frames of a map.
         poses: New poses, by sensor and stamp.
-        least_m: Metres by which something in view must move.
-        reach_m: How far away in metres that may be.
+        least_m: Least motion in metres of something in view.
+        reach_m: Largest distance in metres of it.
     """
     found = {}
     for frame in frames:
@@ -116,15 +116,15 @@ def noticeable(
 
 
 class OdometryJumps:
-    """Notices that another program has moved odometry's frame in the map, and finds out where frames belong by that.
+    """Detects that another program moved odometry's frame in the map, and corrects frames accordingly.
 
-    A jump says by how much the pose of a camera was wrong in the end, and not how that came about. It is spread over
-    the way since the last jump: a frame halfway is moved half as far. This is an approximation; a path of corrected
-    poses (`poses_by_path`) is exact. Frames afterwards have the new transform by themselves.
+    A jump shows the final error of a camera's pose, but not how it grew. It is spread over the path since the last
+    jump: a frame halfway is moved half as far. This is an approximation; a path of corrected poses (`poses_by_path`) is
+    exact. Later frames already have the new transform.
 
     Args:
-        cell: Size of a cell in metres: smaller moves, of anything in view, are no jump yet; they add up.
-        reach_m: How far cameras see, in metres.
+        cell: Size of a cell in metres: smaller motions in view are no jump yet; they add up.
+        reach_m: Range of the cameras in metres.
     """
 
     def __init__(self, cell: float, reach_m: float):
@@ -132,7 +132,7 @@ class OdometryJumps:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all frames so far: another map begins."""
+        """Forget all frames: another map begins."""
         self._frames = list[_Driven]()
         self._last, self._way = dict[str, Transform](), dict[str, float]()
         self._start: Transform | None = None
@@ -141,17 +141,17 @@ class OdometryJumps:
     def add(
         self, sensor: str, stamp_ns: int, T_map_odom: Transform, T_odom_sensor: Transform, *, in_map: bool = True
     ) -> dict[FrameKey, Transform]:
-        """Take note of a frame.
+        """Record a frame.
 
         Args:
             sensor: Its sensor.
             stamp_ns: Its time in nanoseconds.
-            T_map_odom: (4, 4), where odometry's frame is in the map at that time.
-            T_odom_sensor: (4, 4), where the sensor is by odometry.
-            in_map: Whether the frame is in the map; one that was refused may show a jump all the same.
+            T_map_odom: (4, 4), odometry's frame in the map at that time.
+            T_odom_sensor: (4, 4), the sensor's pose by odometry.
+            in_map: Whether the frame is in the map; a refused one may still show a jump.
 
         Returns:
-            Poses (4, 4) for `Mapper.correct`, by sensor and stamp, where a jump has just come to its end; else nothing.
+            Poses (4, 4) for `Mapper.correct`, by sensor and stamp, if a jump has just ended; else nothing.
         """
         if self._start is None:
             self._start = self._before = T_map_odom
@@ -166,7 +166,7 @@ class OdometryJumps:
             return {}
         count = len(self._frames)
         while count and self._moved(self._frames[count - 1], T_map_odom) < SLIGHT * self._cell:
-            count -= 1  # it has the new transform already
+            count -= 1  # it already has the new transform
         before, after = self._frames[:count], self._frames[count:]
         found, ways = self._spread(before, self._start, T_map_odom)
         self._frames = [frame._replace(way=frame.way - ways.get(frame.key[0], 0.0)) for frame in after]
@@ -177,7 +177,7 @@ class OdometryJumps:
     def _spread(
         self, frames: Sequence[_Driven], start: Transform, end: Transform
     ) -> tuple[dict[FrameKey, Transform], dict[str, float]]:
-        """Return new poses of frames, with odometry's frame at `start` first and at `end` last; the way by sensor."""
+        """Return new poses of frames, with odometry's frame from `start` to `end`, and the path length by sensor."""
         found, ways = dict[FrameKey, Transform](), {frame.key[0]: frame.way for frame in frames}
         for frame in frames:
             whole = ways[frame.key[0]]
@@ -193,7 +193,7 @@ class OdometryJumps:
 
 
 class _Driven(NamedTuple):
-    """A frame as it was mapped, and the way in metres of its sensor from the last jump to it."""
+    """A frame as mapped, and its sensor's path in metres since the last jump."""
 
     key: tuple[str, int]
     T_map_odom: Transform
@@ -208,7 +208,7 @@ def _key(frame: KeptFrame) -> tuple[str, int]:
 def _own_poses(
     frames: Sequence[KeptFrame], path: Poses, T_body_sensor: Transform
 ) -> tuple[dict[FrameKey, Transform], list[_Anchor]]:
-    """Return the poses that frames of one sensor, in order of time, have in a path, and how it moves the sensor."""
+    """Return the poses of one sensor's frames, in order of time, in a path, and the sensor's motions by it."""
     new, anchors, used = dict[FrameKey, Transform](), list[_Anchor](), set[int]()
     stamps = path.stamps_ns.tolist()
     for frame in frames:
@@ -238,7 +238,7 @@ def _anchor(stamp_ns: int, T_old: Transform, T_new: Transform) -> _Anchor:
 def _between(
     frames: Sequence[KeptFrame], anchors: Sequence[_Anchor], new: Mapping[FrameKey, Transform]
 ) -> dict[FrameKey, Transform]:
-    """Return poses of frames that have no new one and lie between two anchors, which are in order of time."""
+    """Return poses of frames without a new one between two of the anchors, which are in order of time."""
     stamps, found = [anchor.stamp_ns for anchor in anchors], dict[FrameKey, Transform]()
     for frame in frames:
         after = bisect_left(stamps, frame.stamp_ns)
@@ -249,26 +249,26 @@ def _between(
 
 
 def _as_both_move(frame: KeptFrame, before: _Anchor, after: _Anchor) -> Transform:
-    """Return the pose of a frame between two times of which is known how it moves then, interpolated in time."""
+    """Return a frame's pose between two anchors, with their motions interpolated in time."""
     start, end = before.stamp_ns, after.stamp_ns
     share = (frame.stamp_ns - start) / (end - start) if end > start else 0.0
     return interpolate(before.T_new_old @ frame.T_world_sensor, after.T_new_old @ frame.T_world_sensor, share)
 
 
 def _nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int:
-    """Return the number of the nearest of ascending stamps."""
+    """Return the index of the nearest of ascending stamps."""
     return min(_beside(stamps_ns, stamp_ns), key=lambda k: abs(stamps_ns[k] - stamp_ns))
 
 
 def _beside(stamps_ns: Sequence[int], stamp_ns: int) -> set[int]:
-    """Return the numbers of the ascending stamps before and after a time, one number at the ends."""
+    """Return the indices of the ascending stamps before and after a time, one at the ends."""
     after = bisect_left(stamps_ns, stamp_ns)
     return {max(after - 1, 0), min(after, len(stamps_ns) - 1)}
 
 
 def _where(frames: Sequence[KeptFrame], stamp_ns: int) -> Transform | None:
-    """Return where a sensor was at a time between two of its frames, in order; None if one is 0.1 s or more away,
-    or so near that another pose, which is nearer, is its own.
+    """Return a sensor's pose at a time between two of its frames, in order; None if one is 0.1 s or more away, or so
+    near that another, nearer pose belongs to it.
     """
     after = bisect_left(frames, stamp_ns, key=lambda frame: frame.stamp_ns)
     if after in (0, len(frames)):
@@ -282,7 +282,7 @@ def _where(frames: Sequence[KeptFrame], stamp_ns: int) -> Transform | None:
 
 
 def _moves(one: Transform, other: Transform, reach_m: float) -> float:
-    """Return by how many metres something so far away from a sensor moves at most, from one pose to another."""
+    """Return the largest motion in metres of a point at `reach_m` when the sensor moves between two poses."""
     shift, turn = _apart(one, other)
     return shift + turn * reach_m
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Merge maps: by their frames where both kept them, exactly; else by adding up their evidence."""
+"""Merge maps: exactly, by their frames, if both kept them; else by adding their evidence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from stereovox.products.merge import together
 from stereovox.products.moved import rigid
 
 OF_WORLD = {"up", "up_direction", "levelled_from"}
-"""Settings that may differ where a transform says how the worlds lie."""
+"""Settings that may differ if a transform between the worlds is given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class Joined:
     """Result of `join`.
 
     Attributes:
-        map: The map of the frames of both; it keeps them.
-        T_a_b: (4, 4) how the second map's world was found to lie in the first one's, before both were bent.
-        found: In how many places.
-        loops: Number of loops in both and between them that the poses now agree with.
+        map: The map from the frames of both; it keeps them.
+        T_a_b: (4, 4) from the second map's world to the first one's, as found before both were corrected.
+        found: Number of places at which it was found.
+        loops: Number of loops in and between both that the corrected poses satisfy.
     """
 
     map: VoxelMap
@@ -52,36 +52,36 @@ class Joined:
 
 @one_state
 def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
-    """Find where a second map lies in the first by what both saw, and make one map of both.
+    """Align a second map with the first by their common view, and make one map from both.
 
-    The ways of both cameras become one pose graph, in which loops are closed and all that sees the same is laid onto
-    each other; then all frames are mapped at the poses that this gives, in the order of their stamps. The first frame
-    of `a` stays where it is.
+    The trajectories of both cameras become one pose graph, in which loops are closed and overlapping submaps are
+    registered to each other; then all frames are mapped at the resulting poses, in the order of their stamps. The first
+    frame of `a` stays fixed.
 
     Args:
         a: A map that kept all its frames, whose settings the result has.
-        b: Another one, made with the same settings; its world may lie anywhere, with the same way up.
-        progress: Called with how many are done, how many there are, and the current step.
+        b: Another one, made with the same settings; its world may be anywhere, with the same up direction.
+        progress: Called with the number done, the total, and the current step.
 
     Returns:
-        The map, and how they lie.
+        The map, and the transform.
 
     Raises:
-        StereovoxError: Frames were not kept, settings differ, or where the second map lies cannot be found for sure.
+        StereovoxError: Frames were not kept, settings differ, or the transform cannot be found with certainty.
         MissingExtra: gtsam is not installed.
     """
     check_alike(a, b, np.eye(4))
     why = why_added(a, b, np.eye(4))
     if why is not None or a.kept_frames is None or b.kept_frames is None:
-        raise StereovoxError(f"where one map lies in the other can be found only by frames, and {why}")
+        raise StereovoxError(f"the transform between maps can be found only from frames, and {why}")
     check_one_way(a.history, a.kept_frames.frames)
     check_one_way(b.history, b.kept_frames.frames)
     closers = [_closed(one, words, progress) for one, words in ((a, "first"), (b, "second"))]
     first, second = closers
-    place = placed(first, second, lambda done, total: progress(done, total, "finding the second map in the first"))
+    place = placed(first, second, lambda done, total: progress(done, total, "locating the second map in the first"))
     count = len(first.submaps)
     first.join(second, place.T_first_second, place.loops)
-    first.finish(lambda done, total: progress(done, total, "laying places onto each other"))
+    first.finish(lambda done, total: progress(done, total, "registering places"))
     poses = [first.corrected(slice(0, count)), first.corrected(slice(count, None))]
     frames = [
         [replace(frame, T_world_sensor=found[frame.sensor, frame.stamp_ns]) for frame in kept.frames]
@@ -96,7 +96,7 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
 
 
 def _follow(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> bool:
-    """Return whether all frames of one recording are earlier than those of the other, so that both are one way."""
+    """Return whether all frames of one recording precede all of the other's, so that both are one trajectory."""
     (first_a, last_a), (first_b, last_b) = (
         (min(stamps), max(stamps)) for stamps in ([frame.stamp_ns for frame in frames] for frames in (a, b))
     )
@@ -104,7 +104,7 @@ def _follow(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> bool:
 
 
 def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:
-    """Return all of a recording, its loops closed."""
+    """Return a whole recording, its loops closed."""
     assert one.kept_frames is not None
     closer, frames = LoopCloser(one.config), one.kept_frames.frames
     for done, frame in enumerate(frames, 1):
@@ -118,11 +118,12 @@ def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:
 def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     """Merge two maps.
 
-    Where both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
-    order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame
-    that is in both, as where the parts of a recording overlap, counts once, from its pose in `a`. Where they cannot be
-    merged so (`why_added` says why), their evidence adds up: see `products.merge`. Cells that had reached their limits
-    may then differ from those of one run.
+    If both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
+    order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame in
+    both, as from overlapping parts of a recording, counts once, with its pose in `a`. Otherwise (`why_added` gives the
+    reason) their evidence adds up: see `products.merge`. Cells that had reached their limits may then differ from those
+    of one run.
+
 
     Args:
         a: A map, whose settings the result has.
@@ -134,7 +135,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
 
     Raises:
         StereovoxError: The cell sizes differ, T_a_b is not a rigid motion, or there is none and the maps' `up` differs.
-        MapFileError: Kept frames of a map that was loaded are gone from the disk.
+        MapFileError: Kept frames of a loaded map are gone from the disk.
     """
     check_alike(a, b, T_a_b)
     if why_added(a, b, T_a_b) is not None:
@@ -143,7 +144,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
 
 
 def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str | None:
-    """Return why two maps are merged by adding up, which is not exact; None if they are merged by their frames.
+    """Return why two maps are merged by adding evidence, which is not exact; None if by their frames.
 
     Args:
         a: A map.
@@ -165,7 +166,7 @@ def why_added(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> str |
 
 
 def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
-    """Return how many kept frames two maps have in common; `merge` counts them once.
+    """Return the number of kept frames common to two maps; `merge` counts them once.
 
     Raises StereovoxError if a map did not keep its frames.
     """
@@ -174,14 +175,14 @@ def frames_in_both(a: VoxelMap, b: VoxelMap) -> int:
 
 
 def _differing(a: Config, b: Config, ignored: set[str]) -> str | None:
-    """Return the name of a setting by which two maps would take in a frame differently."""
+    """Return the name of a setting by which two maps would map a frame differently."""
     names = [name for name in ("map", *settings_of_frames(a)) if name not in ignored]
     a = a.model_copy(update={"map": a.map.model_copy(update={"frames_budget": b.map.frames_budget})})
     return next((name for name in names if getattr(a, name) != getattr(b, name)), None)
 
 
 def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
-    """Return the map of the frames of both."""
+    """Return the map from the frames of both."""
     assert a.kept_frames is not None
     assert b.kept_frames is not None
     theirs = b.kept_frames.frames
@@ -193,7 +194,7 @@ def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
 
 
 def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequence[KeptFrame]) -> VoxelMap:
-    """Return the map of the frames of both, at the poses given here; what both have is taken once, from the first."""
+    """Return the map from the frames of both, at the given poses; common frames are taken once, from the first."""
     known = set(map(_identity, ours))
     twice = [frame for frame in theirs if _identity(frame) in known]
     theirs = [frame for frame in theirs if _identity(frame) not in known]
@@ -210,12 +211,12 @@ def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequ
 
 
 def _identity(frame: KeptFrame) -> tuple[str, int, str]:
-    """Return what two maps of one recording have in common of a frame, whatever its pose."""
+    """Return what identifies a frame in two maps of one recording, whatever its pose."""
     return frame.sensor, frame.stamp_ns, frame.packed.digest
 
 
 def _in_order(a: Sequence[KeptFrame], b: Sequence[KeptFrame]) -> list[KeptFrame]:
-    """Return the frames of both maps by their stamps, those of each in the order in which it took them in."""
+    """Return the frames of both maps by their stamps, each map's in the order in which it added them."""
     result: list[KeptFrame] = []
     left, right = deque(a), deque(b)
     while left and right:

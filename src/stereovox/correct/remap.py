@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections from outside for a saved map: a file of better poses, as pose graphs and bundle adjustment write it."""
+"""Corrections from outside for a saved map: a file of better poses, as from pose graphs and bundle adjustment."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Remapped:
     Attributes:
         map: The corrected map, as saved.
         out: Where it was saved.
-        report: What the correction did.
+        report: Report of the correction.
         posed: Number of frames whose pose is in the file.
-        between: Number of frames between them, which were moved as their neighbours before and after.
-        outside: Number of frames before the first or after the last of them, which stayed where they were.
-        repeated: Number of poses that were not used, since one before them in the file has their stamp.
-        beyond: Number of poses that were not used, since they are from before the first frame or after the last.
-        moved_m: Metres by which frames moved: the median and the most.
-        turned_deg: Degrees by which they turned: the median and the most.
-        way_m: Largest extent in metres of where the frames were before, along an axis.
+        between: Number of frames between them, which moved like their neighbours.
+        outside: Number of frames before the first or after the last of them, which were not moved.
+        repeated: Number of unused poses, whose stamp an earlier line already has.
+        beyond: Number of unused poses from before the first frame or after the last.
+        moved_m: Metres by which frames moved: median and maximum.
+        turned_deg: Degrees by which they turned: median and maximum.
+        way_m: Largest extent in metres of the original frame positions along an axis.
     """
 
     map: VoxelMap
@@ -56,7 +56,7 @@ class Remapped:
     way_m: float
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `stereovox remap --json`, besides those of the map."""
+        """Return the numbers of `stereovox remap --json`, except the map's."""
         counts = {name: getattr(self, name) for name in ("posed", "between", "outside", "repeated", "beyond")}
         moves = {
             name: dict(zip(("median", "max"), getattr(self, name), strict=True)) for name in ("moved_m", "turned_deg")
@@ -65,25 +65,26 @@ class Remapped:
 
 
 def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str | None = None) -> Remapped:
-    """Give the frames of a saved map corrected poses, and save the map that they make.
+    """Give the frames of a saved map corrected poses, and save the resulting map.
 
-    A frame has the pose whose stamp is within half a millisecond of its own. Other frames between the poses, and those
-    of other sensors, are moved as these, see `poses_by_path`. Frames before the first and after the last one stay where
-    they are.
+    A frame takes the pose whose stamp is within half a millisecond of its own. Other frames between the poses, and
+    frames of other sensors, move like these, see `poses_by_path`. Frames before the first pose and after the last are
+    not moved.
+
 
     Args:
         path: Folder of a map that kept its frames (`map.keep_frames`).
         poses: File of lines `stamp tx ty tz qx qy qz qw` (TUM): T_world_sensor of the optical frame, in the world of
-            the recording. A map that was levelled turns them as it turned the recording's own.
+            the recording. A levelled map turns them as it turned the recording's own.
         out: Folder of the corrected map.
-        sensor: Which sensor the poses are of, where the map has several.
+        sensor: Sensor of the poses, if the map has several.
 
     Returns:
-        The corrected map and what was done.
+        The corrected map and the report.
 
     Raises:
-        StereovoxError: One line: a file cannot be read, the map did not keep its frames, no pose is of one of them, or
-            nobody says of which of several sensors they are.
+        StereovoxError: One line: a file cannot be read, the map did not keep its frames, no pose belongs to one of
+            them, or the sensor is ambiguous.
     """
     check_target(Path(out))
     saved, frames = load_with_frames(path)
@@ -113,7 +114,7 @@ def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str |
 
 
 def _beyond(poses: Poses, frames: Sequence[KeptFrame]) -> int:
-    """Return how many poses are too early or too late to say anything of a frame."""
+    """Return how many poses are too early or too late to affect a frame."""
     stamps_ns = [frame.stamp_ns for frame in frames]
     first, last = min(stamps_ns) - MAX_GAP_NS, max(stamps_ns) + MAX_GAP_NS
     return int(np.count_nonzero((poses.stamps_ns < first) | (poses.stamps_ns > last)))
@@ -124,7 +125,7 @@ def _median_and_most(numbers: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _posed_sensor(frames: Sequence[KeptFrame], sensor: str | None, path: str | Path) -> str:
-    """Return the sensor that the poses are of. Raises StereovoxError if that is not clear."""
+    """Return the sensor of the poses. Raises StereovoxError if that is ambiguous."""
     names = sorted({frame.sensor for frame in frames})
     if (sensor is None and len(names) > 1) or (sensor is not None and sensor not in names):
         given = "which one the poses are of" if sensor is None else f"another name than '{sensor}'"
@@ -133,7 +134,7 @@ def _posed_sensor(frames: Sequence[KeptFrame], sensor: str | None, path: str | P
 
 
 def _in_map(poses: Poses, config: Config) -> Poses:
-    """Return poses in the world of a map, which may have been levelled."""
+    """Return poses in the world of a map that may have been levelled."""
     if config.levelled_from is None:
         return poses
     T = level_transform(config.levelled_from) @ poses.T_world_body

@@ -14,7 +14,7 @@ _BITS = 21
 _HALF = 1 << (_BITS - 1)
 
 Keys = NDArray[np.int64]
-"""(N,) int64, ascending and unique where it is a set."""
+"""(N,) int64, ascending and unique if it is a set."""
 
 
 def occupied_cells(voxel_map: VoxelMap) -> NDArray[np.int64]:
@@ -36,7 +36,7 @@ def indices(cell_keys: Keys) -> NDArray[np.int32]:
 
 
 def position(cell_keys: Keys, among: Keys) -> NDArray[np.int64]:
-    """Return the index of each key (N,) in the ascending set `among`, -1 where it is absent."""
+    """Return the index of each key (N,) in the ascending set `among`, -1 if it is absent."""
     if not len(among):
         return np.full(len(cell_keys), -1)
     place = np.minimum(np.searchsorted(among, cell_keys), len(among) - 1)

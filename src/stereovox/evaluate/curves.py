@@ -20,7 +20,7 @@ class Roc:
     """Receiver operating characteristic, as the threshold falls from 1 to 0.
 
     threshold: (M,) falling, inf first; at each, cells with p >= threshold are called occupied.
-    false_positive_rate: (M,) share of the free cells that are called so; true_positive_rate: (M,) of the occupied ones.
+    false_positive_rate: (M,) share of the free cells called occupied; true_positive_rate: (M,) of the occupied cells.
     surface_share: share of the cells that are occupied.
     """
 
@@ -32,7 +32,7 @@ class Roc:
 
     @property
     def average_precision(self) -> float:
-        """Area below precision against recall, each step at its lower threshold's precision; cells of one p at once."""
+        """Area below precision against recall, each step at its lower threshold's precision; equal p together."""
         occupied = self.surface_share * self.true_positive_rate[1:]
         precision = occupied / (occupied + (1 - self.surface_share) * self.false_positive_rate[1:])
         return float(precision @ np.diff(self.true_positive_rate))
@@ -70,7 +70,7 @@ class PrecisionRecall:
         return {name: value if np.isfinite(value) else None for name, value in values.items()}
 
     def best(self, names: tuple[str, str] = TOLERANT, wanted: tuple[float, float] = (0.0, 0.0)) -> dict[str, Any]:
-        """Return the point where the lesser of the two measures, each less what is wanted of it, is largest."""
+        """Return the point where the lesser of the two measures, each minus its wanted value, is largest."""
         margins = [
             np.nan_to_num(getattr(self, name), nan=-1.0) - goal for name, goal in zip(names, wanted, strict=True)
         ]
@@ -82,7 +82,7 @@ def precision_recall(
 ) -> PrecisionRecall:
     """Return precision and recall over all cells of the truth at `thresholds` (M,).
 
-    actual, near: (N,) cells that hold a surface, and that have one within the tolerance. Unobserved cells are free.
+    actual, near: (N,) cells with a surface, and cells with one within the tolerance. Unobserved cells are free.
     """
     thresholds = np.asarray(thresholds, float)
     levels = np.array([level(threshold) for threshold in thresholds])
@@ -102,6 +102,6 @@ def above(values: NDArray[np.floating], levels: NDArray[np.float64]) -> NDArray[
 
 
 def shares(part: NDArray[np.integer], whole: NDArray[np.integer] | int) -> NDArray[np.float64]:
-    """Return part / whole, NaN where the whole is zero."""
+    """Return part / whole, NaN if the whole is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(np.asarray(whole) > 0, part / np.asarray(whole, float), np.nan)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The decisions of a map by range, by thickness of what is there, and by how often it was looked at."""
+"""The decisions of a map by range, by thickness of the surface, and by number of looks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Part:
     """The decisions over a part of the truth's cells.
 
     by: `range`, `thickness` or `looks`; name: of the part, such as `2 to 4 m`, `line`, `3 to 9`. Thickness and looks
-    are those of surface cells, so their parts hold no free cells of the truth.
+    refer to surface cells, so their parts have no free cells of the truth.
     """
 
     by: str
@@ -47,7 +47,7 @@ def decision_parts(
 ) -> tuple[Part, ...]:
     """Return the decisions by part; parts without cells are left out.
 
-    path: camera positions (P, 3) in metres, world frame: by distance to the nearest of them, in rings between `edges`
+    path: camera positions (P, 3) in metres, world frame: parts by distance to the nearest one, in rings between `edges`
     (M + 1,) in metres or of a round width; None: not by range. looks: (S,) of each surface cell; None: not by looks.
     """
     split = [

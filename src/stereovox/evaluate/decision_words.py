@@ -25,7 +25,7 @@ def state_rows(found: Decisions) -> list[tuple[str, ...]]:
 
 
 def error_rows(found: Decisions, tolerance: int) -> list[tuple[str, ...]]:
-    """Return the rows below `ERROR_HEADS`: what goes wrong, the worst first."""
+    """Return the rows below `ERROR_HEADS`: the errors, the worst first."""
     cells = "1 cell" if tolerance == 1 else f"{tolerance} cells"
     surface, known, occupied, free = (f"{n:,}" for n in (found.surface, found.known, found.occupied, found.free))
     return [
@@ -41,7 +41,7 @@ def error_rows(found: Decisions, tolerance: int) -> list[tuple[str, ...]]:
 
 
 def part_rows(parts: Sequence[Part]) -> list[tuple[str, ...]]:
-    """Return the rows below `PART_HEADS`; what the map calls occupied is told by range alone."""
+    """Return the rows below `PART_HEADS`; cells called occupied are reported by range only."""
     return [
         (
             f"{part.by}: {part.name}",

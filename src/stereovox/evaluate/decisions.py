@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map decides of each cell (occupied, tentative, free, unknown) against the truth: the rates of its errors."""
+"""A map's decision on each cell (occupied, tentative, free, unknown) against the truth: its error rates."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from stereovox.maps import State, VoxelMap
 
 @dataclass(frozen=True)
 class Decisions:
-    """The states that a map gives the cells of the truth; shares from 0 to 1, None for a share of nothing.
+    """The states that a map gives the cells of the truth; shares from 0 to 1, None if there are no such cells.
 
-    Of the truth's `surface` cells (a number): surface_occupied, surface_tentative, surface_free (the error that kills)
-    and surface_unknown, the shares in each state; surface_free_alone: free, and nothing tentative or occupied within
-    one cell; surface_occupied_near, surface_near: with a cell within the tolerance that is occupied, or occupied or
-    tentative. Of those that the map knows, `known` in number: known_free, known_free_alone, the same.
+    Of the truth's `surface` cells (a number): surface_occupied, surface_tentative, surface_free (the fatal error) and
+    surface_unknown, the shares in each state; surface_free_alone: free, with nothing tentative or occupied within one
+    cell; surface_occupied_near, surface_near: with a cell within the tolerance that is occupied, or occupied or
+    tentative. Of those known to the map, `known` in number: known_free, known_free_alone, likewise.
     Of the truth's `air` cells, free ones: air_occupied, air_tentative, air_free, air_unknown.
     Of the map's `occupied` cells that the truth knows: occupied_hit, with a surface in it; occupied_near, with one
     within the tolerance; occupied_air, free in the truth. Of the map's `free` ones: free_wrong, with a surface in it.
@@ -51,9 +51,9 @@ class Decisions:
 
 
 def decisions(voxel_map: VoxelMap, truth: VoxelMap | TruthCells) -> Decisions:
-    """Compare the state that `voxel_map` itself gives each cell of the truth with what is there.
+    """Compare the state that `voxel_map` itself gives each cell of the truth with the truth.
 
-    truth: a map whose occupied cells hold a surface and whose free cells were in view and hold none, or `TruthCells`,
+    truth: a map whose occupied cells have a surface and whose free cells were in view and have none, or `TruthCells`,
     made once for many maps. Raises StereovoxError for maps of different cell sizes and an empty truth.
     """
     cells = truth if isinstance(truth, TruthCells) else TruthCells(truth)
@@ -61,7 +61,7 @@ def decisions(voxel_map: VoxelMap, truth: VoxelMap | TruthCells) -> Decisions:
 
 
 def decide(reading: Reading, truth: TruthCells, chosen: NDArray[np.bool_] | None = None) -> Decisions:
-    """Return the decisions over the `chosen` cells (N,) of the truth; None: over all."""
+    """Return the decisions over the `chosen` cells (N,) of the truth; None: all."""
     counted = np.ones(len(truth.cells), bool) if chosen is None else chosen
     is_surface = truth.occupied & counted
     surface, air = _numbers(reading.states[is_surface]), _numbers(reading.states[counted & ~truth.occupied])
@@ -93,5 +93,5 @@ def decide(reading: Reading, truth: TruthCells, chosen: NDArray[np.bool_] | None
 
 
 def _numbers(states: NDArray[np.uint8]) -> list[int]:
-    """Return how many cells are in each `State`, by its number."""
+    """Return the number of cells in each `State`, indexed by state."""
     return np.bincount(states, minlength=len(State)).tolist()

@@ -17,9 +17,9 @@ RINGS = 8
 
 @dataclass(frozen=True, eq=False)
 class ByDistance:
-    """Precision and recall of the cells in M rings; ring i holds edges[i] <= distance < edges[i + 1], in metres.
+    """Precision and recall of the cells in M rings; ring i covers edges[i] <= distance < edges[i + 1], in metres.
 
-    edges: (M + 1,). marked, surface: (M,) number of cells that the map calls occupied, and that truly are.
+    edges: (M + 1,). marked, surface: (M,) number of cells that the map calls occupied, and of truly occupied ones.
     The others: (M,), NaN in a ring without such cells.
     """
 

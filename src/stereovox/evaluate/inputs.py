@@ -17,17 +17,17 @@ from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.files.store import is_map
 
 COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
-"""Columns of x, y, z by the numbers in a line: x y z; TUM, with or without a confidence; 3x4 and 4x4 matrices."""
+"""Columns of x, y, z by numbers per line: x y z; TUM, with or without a confidence; 3x4 and 4x4 matrices."""
 
 
 STRAYING = 1.5
-"""A path fits only if surfaces lie within this many times the map's range."""
+"""A path fits only if surfaces are within this many times the map's range."""
 
 
 def read_camera_path(path: str | Path) -> NDArray[np.float64]:
-    """Read camera positions (P, 3) in metres from a text file with one pose per line; `#` begins a comment.
+    """Read camera positions (P, 3) in metres from a text file with one pose per line; `#` starts a comment.
 
-    A line holds x y z, or `stamp x y z qx qy qz qw` (TUM), or the 12 (KITTI) or 16 numbers of a matrix row by row.
+    A line has x y z, or `stamp x y z qx qy qz qw` (TUM), or the 12 (KITTI) or 16 numbers of a matrix row by row.
     Raises SourceError: one line with the file and what is wrong.
     """
     try:
@@ -41,9 +41,9 @@ def read_camera_path(path: str | Path) -> NDArray[np.float64]:
 
 
 def path_fits(path: NDArray[np.float64], truth: TruthCells, max_range: float) -> bool:
-    """Return whether a path (P, 3) fits the truth: half of the surfaces lie within reach of a position.
+    """Return whether a path (P, 3) fits the truth: half of the surfaces are within reach of a position.
 
-    max_range: of the map, in metres. A path in a frame other than the map's world seldom fits.
+    max_range: of the map, in metres. A path in another frame than the map's world rarely fits.
     """
     surfaces = truth.centers()[truth.occupied]
     return bool(2 * np.count_nonzero(distances(surfaces, path) > STRAYING * max_range) <= len(surfaces))

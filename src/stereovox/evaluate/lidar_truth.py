@@ -39,11 +39,11 @@ IN_VIEW, CROSSED, HIT = 1, 2, 4
 
 
 def inside(points: NDArray[np.floating], corners: Corners) -> NDArray[np.bool_]:
-    """Return which points (N, 3) lie in the box with these corners, faces included (Valenti 2018, Eq A.1-A.3).
+    """Return which points (N, 3) are in the box with these corners, faces included (Valenti 2018, Eq A.1-A.3).
 
-    As printed the test can never hold: u, v and w cannot all point from p0 to the other corners, whatever their order,
-    since (p0 - p1) x (p0 - p4) has the wrong sign, and Eq A.2 compares x, y, z in place of p. Here v is negated, and
-    all three are where the corners are left-handed.
+    The printed test can never hold: u, v and w cannot all point from p0 to the other corners, whatever their order,
+    because (p0 - p1) x (p0 - p4) has the wrong sign, and Eq A.2 compares x, y, z instead of p. Here v is negated, and
+    all three if the corners are left-handed.
     """
     p0, p1, p3, p4 = corners
     a, b, c = p1 - p0, p3 - p0, p4 - p0
@@ -64,7 +64,7 @@ def corners_of(box: Box, margin: float = 0.0) -> Corners:
 
 
 def in_any_box(points: NDArray[np.floating], boxes: Iterable[Box], margin: float = 0.0) -> NDArray[np.bool_]:
-    """Return which points (N, 3), metres in the world, in one of `boxes` enlarged by `margin` metres."""
+    """Return which points (N, 3), metres in the world, are in one of `boxes` enlarged by `margin` metres."""
     found = np.zeros(len(points), bool)
     for box in boxes:
         found |= inside(points, corners_of(box, margin))
@@ -85,7 +85,7 @@ class Volume:
 
 
 def project(camera: PinholeCamera, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Project points (N, 3) in the optical frame to pixels (N, 2), and return which fall into the image.
+    """Project points (N, 3) in the optical frame to pixels (N, 2), and return which are in the image.
 
     The image reaches half a pixel beyond the centres of its outermost pixels. Pixels of points behind the camera are
     NaN.
@@ -113,7 +113,7 @@ def view_volume(viewpoint: Viewpoint, max_range: float, voxel_size: float) -> Vo
 
 
 def blocks_in(volume: Volume) -> Iterator[tuple[NDArray[np.int32], NDArray[np.bool_]]]:
-    """Yield blocks (n, 3) of 8x8x8 cells and which of their cells (n, 512) have their centre in `volume`."""
+    """Yield blocks (n, 3) of 8x8x8 cells and a mask of their cells (n, 512) with the centre in `volume`."""
     inner, border = _candidates(volume)
     for some in _pieces(inner):
         yield some, np.ones((len(some), SIDE**3), bool)
@@ -138,7 +138,7 @@ def _candidates(volume: Volume) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def _sides(volume: Volume, boxes: NDArray[np.int_], width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which boxes (n, 3), `width` cells wide, lie wholly inside the volume, and which may be partly inside."""
+    """Return which boxes (n, 3), `width` cells wide, are wholly inside the volume, and which may be partly inside."""
     distance = (boxes + 0.5) * width @ volume.normals.T + volume.offsets
     reach = width / 2 * np.abs(volume.normals).sum(axis=1)
     wholly = (distance >= reach).all(axis=1)
@@ -161,7 +161,7 @@ class TruthCounts:
     """Counts of lidar points and of the resulting cells.
 
     frames: scans used; refused: number of others by reason; first_refusal: one line about the first of them.
-    points: of all scans used; `used` of them count, `out_of_range` of those from beyond the range of their own frame;
+    points: of all scans used; `used` of them count, including `out_of_range` from beyond the range of their own frame;
     the others were dropped: outside the left image, in an annotated box, on pixels flagged as moving.
     """
 
@@ -196,14 +196,14 @@ def lidar_truth(
     """Make the true map of a recording; return it with the counts behind it.
 
     Cells count if their centre is in view of at least one frame, at most `max_range` metres away along the optical
-    axis. Such a cell is occupied where at least one lidar point of any frame lies in it, inside the left image, outside
-    every annotated box (enlarged by `box_margin` metres) and not on something moving; since lidar is as exact far away,
-    a point beyond the range of its own frame counts for a frame that has it within. The others are free (`view`), or
-    only those that a lidar ray crosses (`rays`). The rest is unknown. Points are not weighed against rays through the
+    axis. Such a cell is occupied if at least one lidar point of any frame is in it, inside the left image, outside
+    every annotated box (enlarged by `box_margin` metres) and not on a moving object; lidar is as accurate far away, so
+    a point beyond the range of its own frame counts for another frame within range. All others are free (`view`), or
+    only those crossed by a lidar ray (`rays`). The rest is unknown. Points are not weighed against rays through the
     same cell: one point is enough.
     frames: which frames, as `A:B:S` or numbers; None: all. Their images are not read. watch(numbers, count) yields the
     numbers again, for a progress bar.
-    Raises SourceError if the source has no lidar or not one scan can be used, StereovoxError for bad values.
+    Raises SourceError if the source has no lidar or no usable scan, StereovoxError for bad values.
     """
     if free not in FREE:
         raise StereovoxError(f"free '{free}' is not known; say {' or '.join(FREE)}")
@@ -252,7 +252,7 @@ class _Truth:
         self._last = viewpoint
 
     def map(self) -> VoxelMap:
-        """Return the map; raises SourceError if not one scan could be used."""
+        """Return the map; raises SourceError if no scan was usable."""
         counts = self.counts
         if not counts.frames:
             raise SourceError(f"{self.source.name}: not one lidar scan can be used ({counts.first_refusal})")

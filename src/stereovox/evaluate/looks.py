@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From how many places of a map's own path each true surface cell could be seen."""
+"""Number of places on a map's own path from which each true surface cell could be seen."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.maps import VoxelMap
 
 MOST_PLACES = 100
-"""Places that are tried; of a longer path evenly chosen ones stand for all."""
+"""Most places tried; a longer path is sampled evenly."""
 _INSIDE = 1e-3
-"""Cells from a face to the point in the cell that is looked at."""
+"""Distance in cells from a face to the target point inside the cell."""
 _FACES = np.array([sign * axis for axis in np.eye(3, dtype=int) for sign in (-1, 1)])
 
 
 def looks(voxel_map: VoxelMap, truth: TruthCells) -> NDArray[np.floating] | None:
-    """Return from how many places (S,) of the path of `voxel_map` each surface cell of the truth could be seen.
+    """Return the number of places (S,) on the path of `voxel_map` that could see each surface cell of the truth.
 
-    A map keeps places of its camera at least 5 cm or 0.1 rad apart (`VoxelMap.path`), so a standing camera looks once,
+    A map keeps places of its camera at least 5 cm or 0.1 rad apart (`VoxelMap.path`), so a standing camera counts once,
     however many frames it takes. None for a map without a path or a camera, such as an imported one, and for one of
-    several sensors, whose cameras it does not keep.
+    several sensors, whose cameras are not kept.
     """
     path, viewpoint = voxel_map.history.path, voxel_map.viewpoint
     if viewpoint is None or len(path.stops) != 1:
@@ -40,9 +40,9 @@ def looks(voxel_map: VoxelMap, truth: TruthCells) -> NDArray[np.floating] | None
 def views(
     truth: TruthCells, poses: Sequence[Transform] | NDArray[np.float64], camera: PinholeCamera, max_range: float
 ) -> NDArray[np.int64]:
-    """Count for each surface cell of the truth (S,) the `poses`, T_world_camera, from which it can be seen.
+    """Count, for each surface cell of the truth (S,), the `poses`, T_world_camera, that can see it.
 
-    It can where the middle of one of its faces is in the image, at most `max_range` metres away along the optical
+    A cell is seen if the middle of one of its faces is in the image, at most `max_range` metres away along the optical
     axis, and the straight line to it meets no other surface cell.
     """
     cells, size = truth.surface(), truth.voxel_size
@@ -62,7 +62,7 @@ def views(
 
 
 def _in_reach(cells: NDArray[np.integer], pose: Transform, max_range: float, size: float) -> NDArray[np.int64]:
-    """Return which cells lie ahead of the camera, within its range and two cells."""
+    """Return which cells are ahead of the camera, within its range and two cells."""
     ahead = ((cells + 0.5) * size - pose[:3, 3]) @ pose[:3, 2]
     return np.flatnonzero((ahead > -2 * size) & (ahead < max_range + 2 * size))
 
@@ -70,7 +70,7 @@ def _in_reach(cells: NDArray[np.integer], pose: Transform, max_range: float, siz
 def _reached(
     truth: VoxelMap, origin: NDArray[np.float64], points: NDArray[np.float64], cells: NDArray[np.integer]
 ) -> NDArray[np.bool_]:
-    """Return which `points` (N, 3), each in its cell, are the first that the ray from `origin` meets."""
+    """Return which `points` (N, 3), each in its cell, are the first hit of the ray from `origin`."""
     if not len(points):
         return np.zeros(0, bool)
     hits = truth.cast_rays(origin, points - origin, np.inf)

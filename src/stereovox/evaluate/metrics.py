@@ -15,7 +15,7 @@ from stereovox.maps import State, VoxelMap
 
 MIN_SHARE = 0.9
 MAX_GAP = 0.1
-"""A piece is missing if a smaller share of its seen cells is found, or a gap is longer (in metres)."""
+"""A piece is missing if a smaller share of its seen cells is found, or a gap in metres is longer."""
 
 
 def ratio(part: float, whole: float) -> float | None:
@@ -57,7 +57,7 @@ def compare(
     """Compare the known cells of a map with the true surface.
 
     known: the map's cells, ascending keys (N,); occupied: (N,) whether the map calls them occupied; surface and
-    excluded: sets of true cells; known cells in `excluded` do not count.
+    excluded: sets of true cells; known cells in `excluded` are ignored.
     tolerance_precision is the share of occupied cells with a surface cell within `tolerance` cells,
     tolerance_recall the share of known surface cells with an occupied cell within `tolerance` cells.
     """
@@ -85,7 +85,7 @@ def known_cells(voxel_map: VoxelMap) -> tuple[Keys, NDArray[np.uint8]]:
 def compare_map(voxel_map: VoxelMap, truth: Truth, tolerance: int = 1) -> dict[str, Any]:
     """Compare a map with the exact occupancy of its scene over the cells the map knows.
 
-    Keys as in `compare`, and `free_in_solid`: cells the map calls free that hold a surface or lie in a solid.
+    Keys as in `compare`, and `free_in_solid`: cells the map calls free that contain a surface or are in a solid.
     """
     known, state = known_cells(voxel_map)
     free = known[state == State.FREE]
@@ -98,7 +98,7 @@ def compare_map(voxel_map: VoxelMap, truth: Truth, tolerance: int = 1) -> dict[s
 class Found:
     """How much of one piece of the scene is in the map.
 
-    seen: its cells seen by enough frames; exact: those that are occupied; near: those with an occupied cell within the
+    seen: its cells seen by enough frames; exact: occupied ones; near: ones with an occupied cell within the
     tolerance; longest_gap: the longest stretch in metres along the piece's longest axis where seen cells have none.
     """
 
@@ -112,10 +112,10 @@ class Found:
 
 
 def find_piece(piece: Piece, seen: NDArray[np.bool_], occupied: Keys, voxel_size: float, tolerance: int = 1) -> Found:
-    """Find `piece` among the `occupied` cells; `seen` (N,) marks the piece's cells that must be there.
+    """Find `piece` among the `occupied` cells; `seen` (N,) marks the piece's cells that must be found.
 
-    The piece is missing when less than MIN_SHARE of those have an occupied cell within `tolerance` cells, or when
-    a stretch of it longer than MAX_GAP metres and two cells has none. An unseen piece is not missing.
+    The piece is missing if less than MIN_SHARE of those have an occupied cell within `tolerance` cells, or if a stretch
+    of it longer than MAX_GAP metres and two cells has none. An unseen piece is not missing.
     """
     cells = piece.cells[seen]
     near = within(cells, occupied, tolerance)
@@ -126,7 +126,7 @@ def find_piece(piece: Piece, seen: NDArray[np.bool_], occupied: Keys, voxel_size
 
 
 def longest_gap(along: NDArray[np.float64], found: NDArray[np.bool_]) -> int:
-    """Return the largest number of consecutive whole steps of `along` (N,) that hold cells but none `found` (N,)."""
+    """Return the largest number of consecutive whole steps of `along` (N,) that have cells but none `found` (N,)."""
     steps, of_cell = np.unique(np.floor(along).astype(np.int64), return_inverse=True)
     empty = np.bincount(of_cell, found, minlength=len(steps)) == 0
     longest = run = 0

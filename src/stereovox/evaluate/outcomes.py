@@ -16,9 +16,9 @@ from stereovox.evaluate.truth_cells import Reading, TruthCells
 class Outcome(IntEnum):
     """Outcome of a cell that the map or the truth calls occupied.
 
-    HIT: both do. NEAR: only the map does, but a surface is within the tolerance; FALSE: none is. FOUND: only the truth
-    does, but the map has an occupied cell within the tolerance; MISSED: it has none; UNSEEN: it has none and has never
-    observed the cell.
+    HIT: both do. NEAR: only the map does, with a surface within the tolerance; FALSE: without one. FOUND: only the
+    truth does, with an occupied cell of the map within the tolerance; MISSED: without one; UNSEEN: without one, and the
+    map has never observed the cell.
     """
 
     HIT = 0

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 BINS = 10
 LIKELY = 0.3
-"""Probability from which a cell is more than a free one: the cells that a threshold is about."""
+"""Probability above which a cell is more than free: the cells that thresholds separate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Cells binned by probability into B bins; bin i holds edges[i] <= p < edges[i + 1].
+    """Cells binned by probability into B bins; bin i covers edges[i] <= p < edges[i + 1].
 
     edges: (B + 1,) from 0 to 1, rising; count: (B,) cells; mean_p, occupied_share: (B,) mean probability and share of
     truly occupied cells, NaN in an empty bin.
@@ -42,8 +42,8 @@ def reliability(p: NDArray[np.floating], actual: NDArray[np.bool_], bins: int = 
 def equal_mass(p: NDArray[np.floating], actual: NDArray[np.bool_], bins: int = BINS) -> Reliability:
     """Compare probabilities (N,) with the true state (N,) in bins of about as many cells each.
 
-    The bin of a cell is that of the middle of its rank among all; cells of one probability share a bin, so that some
-    bins hold more cells than others, and some none.
+    A cell's bin follows the middle of its rank; cells of equal probability share a bin, so that bins may differ in
+    size, or be empty.
     """
     values, of_cell, number = np.unique(p, return_inverse=True, return_counts=True)
     middle = np.cumsum(number) - number / 2

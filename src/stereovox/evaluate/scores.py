@@ -26,10 +26,10 @@ _NOT_NUMBERS = {"observed", "reliability", "equal_mass", "roc", "curve", "distan
 class Tally:
     """Measures over one set of cells; None for a division by zero.
 
-    cells: how many; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6; correlation:
-    Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells called
-    occupied with a surface within the tolerance; tolerance_recall: share of the surface cells with a cell called
-    occupied within it, wherever that lies; iou: intersection over union of both sets, tp / (tp + fp + fn).
+    cells: their number; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6;
+    correlation: Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells
+    called occupied with a surface within the tolerance; tolerance_recall: share of the surface cells with a cell called
+    occupied within it, anywhere; iou: intersection over union of both sets, tp / (tp + fp + fn).
     """
 
     cells: int
@@ -52,7 +52,7 @@ class Tally:
 class QuickScores(Tally):
     """Scores that are cheap enough for every frame: `Tally` over all cells of the truth, unobserved ones as free.
 
-    threshold, tolerance_cells: as asked; coverage: share of the cells that the map has observed. Over observed
+    threshold, tolerance_cells: as given; coverage: share of the cells that the map has observed. Over observed
     cells: error, mean squared error of the probabilities (Eq 8.7); brier, the same under its other name; ece, expected
     calibration error; observed, the measures of `Tally`.
     """
@@ -74,13 +74,13 @@ class QuickScores(Tally):
 @dataclass(frozen=True, eq=False)
 class Scores(QuickScores):
     """All measures. auc, average_precision: areas under the ROC curve and under precision against recall, over all
-    cells (p = 0.5 where unobserved); observed_auc, observed_average_precision likewise.
+    cells (p = 0.5 if unobserved); observed_auc, observed_average_precision likewise.
 
     f_score_1, f_score_2: harmonic mean of precision and recall within one cell, and within two, over all cells.
     balanced: the point of `curve` where the lesser of precision and recall within the tolerance is largest.
     ece_likely: as `ece`, over cells with p >= 0.3; ece_equal_mass: in bins of as many cells.
-    decisions: what the map itself decides, at its own thresholds; parts: the same by range (from the path given, or the
-    map's own), thickness and looks (where the map holds its camera's path).
+    decisions: the map's own decisions, at its own thresholds; parts: the same by range (from the given path, or the
+    map's own), thickness and looks (if the map has its camera's path).
     reliability, equal_mass: over observed cells; roc: over all cells, None unless some are occupied and some free;
     curve: precision and recall against the threshold; distance: the same against distance, None without a path.
     """
@@ -122,10 +122,10 @@ def score(
     path: ArrayLike | None = None,
     edges: ArrayLike | None = None,
 ) -> Scores:
-    """Compare a map with the truth over the cells that the truth knows.
+    """Compare a map with the truth over the cells known to the truth.
 
-    truth_map: a map whose occupied cells hold a surface and whose free cells were in view and hold none; or
-    `TruthCells`, made once for many maps, which has its own tolerance. threshold: a cell is called occupied where
+    truth_map: a map whose occupied cells have a surface and whose free cells were in view and have none; or
+    `TruthCells`, made once for many maps, which has its own tolerance. threshold: a cell is called occupied if
     p > threshold (Eq 8.1). tolerance: cells along each axis. bins: of the reliability diagram; thresholds: (M,) of the
     curve of precision and recall. path: camera positions (P, 3) or one (3,) in metres, world frame, for `distance`;
     edges: its rings in metres. Raises StereovoxError for maps of different cell sizes, an empty truth, and
@@ -163,7 +163,7 @@ def score(
 def f_score(reading: Reading, truth: TruthCells, threshold: float, within: int) -> float | None:
     """Return the harmonic mean of precision and recall within `within` cells, 1 or 2, at p > `threshold`.
 
-    0 where the map calls no cell occupied, None if the truth has no surface.
+    0 if the map calls no cell occupied, None if the truth has no surface.
     """
     marked, found = reading.marked(threshold), reading.best_within(within) > level(threshold)
     precision = ratio(int((marked & truth.near_within(within)).sum()), int(marked.sum()))

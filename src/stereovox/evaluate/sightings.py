@@ -24,9 +24,9 @@ class Sightings:
     def add(
         self, depth_m: NDArray[np.floating], camera: PinholeCamera, T_world_camera: Transform, max_range: float = np.inf
     ) -> None:
-        """Count one frame: a cell is seen where a pixel of exact depth (height, width) up to `max_range` lands in it.
+        """Count one frame: a cell is seen if a pixel of exact depth (height, width) up to `max_range` is in it.
 
-        Depth is in metres along the optical axis; pixels with inf, NaN or a value not above 0 see nothing.
+        Depth is in metres along the optical axis; pixels with inf, NaN or values not above 0 do not count.
         """
         x, y = camera.ray_slopes()
         depth = np.asarray(depth_m, float)
@@ -39,7 +39,7 @@ class Sightings:
             for axis in range(3)
         ]
         seen = keys(np.stack(landed, axis=1))
-        seen = seen[np.diff(seen, prepend=-1) != 0]  # neighbours mostly share a cell: look each up once
+        seen = seen[np.diff(seen, prepend=-1) != 0]  # neighbours mostly share a cell: look up each once
         place = position(seen, self.cells)
         mask = np.zeros(len(self.cells), bool)
         mask[place[place >= 0]] = True

@@ -17,11 +17,11 @@ from stereovox.maps.grid_map import GridMap
 def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
     """Summarise frames, refusals by reason, quality levels, milliseconds, cells and memory of a run.
 
-    `settled`: how often frames were accepted again after a jump or a reset, by the report's description. `quality`:
+    `settled`: number of times frames were accepted again after a jump or a reset, by description. `quality`:
     number of frames by quality level, full or reduced to meet the deadline (docs/safety.md).
-    `frame_ms` is the whole of a frame, `match_ms` (of stereo pairs alone), `depth_ms` and `integrate_ms` are its parts.
-    Times leave out the first mapped frame, which may compile kernels. `memory_reserved`: the memory is that of a
-    window, reserved at the start.
+    `frame_ms` is the whole frame, `match_ms` (stereo pairs only), `depth_ms` and `integrate_ms` are its parts.
+    Times leave out the first mapped frame, which may compile kernels. `memory_reserved`: the memory is a
+    window's, reserved at the start.
     """
     mapped = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)
@@ -42,10 +42,10 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
 
 
 def mostly_lost(frames: int, offered: int, what: str, became: str = "are in the map") -> list[dict[str, Any]]:
-    """Return the doubt of a map that holds less than half of what came, for the summary; else nothing.
+    """Return, for the summary, a doubt if less than half of the frames are in the map; else nothing.
 
-    frames: of `offered` ones of this run that are in the map. what: what they are called (images). became: what those
-    are that are not lost.
+    frames: number of this run's `offered` frames in the map. what: their name (images). became: predicate of the frames
+    that are not lost.
     """
     if 2 * frames >= offered:
         return []
@@ -54,6 +54,6 @@ def mostly_lost(frames: int, offered: int, what: str, became: str = "are in the 
 
 
 def percentiles(milliseconds: Sequence[float]) -> dict[str, float]:
-    """Return median, p90, p99 and max without the first value where there are more; zeros for no values."""
+    """Return median, p90, p99 and max without the first of several values; zeros for no values."""
     values = np.percentile(milliseconds[1:] or milliseconds or [0.0], [50, 90, 99, 100])
     return {name: round(float(value), 4) for name, value in zip(("median", "p90", "p99", "max"), values, strict=True)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How thick what stands in a cell is: a line, a sheet or bulk, by the surface cells around it."""
+"""Thickness of the surface in a cell: line, sheet or bulk, by the surface cells around it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from stereovox.evaluate.truth_cells import Neighbourhood
 
 WINDOW = 2
-"""Cells to each side that are looked at."""
+"""Cells inspected to each side."""
 THIN = 2.5
-"""Cells: an extent below it counts as one or two cells."""
+"""Extent in cells below which a shape counts as one or two cells thick."""
 
 
 class Thickness(IntEnum):
     """Shape of the surface cells around a cell.
 
     LINE: one or two cells across in two directions, like poles, wires, table legs and lone cells. SHEET: in one
-    direction, like walls and floors, edges and corners of them too. BULK: in none, where surfaces meet.
+    direction, like walls and floors, with their edges and corners. BULK: in none, where surfaces meet.
     """
 
     LINE = 0
@@ -31,7 +31,7 @@ class Thickness(IntEnum):
 def thickness(surface: Neighbourhood) -> NDArray[np.uint8]:
     """Return the `Thickness` (S,) uint8 of each surface cell.
 
-    Looked at are the surface cells in the cube of 5 cells a side around it, wherever they point: a row of w cells has
+    It uses the surface cells in the cube of 5 cells a side around it, in any orientation: a row of w cells has
     the variance (w^2 - 1) / 12, so that sqrt(12 v + 1) is the extent in cells along a principal axis of variance v.
     """
     variances = np.linalg.eigvalsh(surface.spread(WINDOW))  # (S, 3), ascending

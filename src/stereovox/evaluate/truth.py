@@ -37,7 +37,7 @@ class Truth:
     """Exact occupancy. `surface` and `inside` are disjoint sets of cell keys; all other cells are free.
 
     surface: cells that a surface touches and that are not wholly inside a solid.
-    inside: cells wholly inside solids: no camera sees them, so they do not count.
+    inside: cells wholly inside solids, ignored because no camera sees them.
     pieces: the solids one by one.
     """
 
@@ -85,9 +85,9 @@ def touched_cells(triangles: NDArray[np.floating], voxel_size: float) -> NDArray
 
 
 def overlaps(triangles: NDArray[np.float64], low: NDArray[np.floating], size: float) -> NDArray[np.bool_]:
-    """Return for each pair whether triangle (N, 3, 3) and box [low, low + size), low (N, 3), share a point.
+    """Return, for each pair, whether triangle (N, 3, 3) and box [low, low + size), low (N, 3), share a point.
 
-    They do not where one of 13 directions separates them: the box's axes, the triangle's normal, and the products of
+    They do not if one of 13 directions separates them: the box's axes, the triangle's normal, and the products of
     box axes and triangle edges. A triangle that merely touches a box's edge or corner counts as sharing it.
     """
     half = size / 2
@@ -107,16 +107,16 @@ def overlaps(triangles: NDArray[np.float64], low: NDArray[np.floating], size: fl
 
 
 def interior_cells(solid: Solid, voxel_size: float) -> NDArray[np.int32]:
-    """Return the cells (M, 3) whose centre lies in the solid."""
+    """Return the cells (M, 3) whose centre is in the solid."""
     low, high = np.floor(solid.bounds / voxel_size).astype(int)
     cells = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
     return cells[solid.contains((cells + 0.5) * voxel_size)].astype(np.int32)
 
 
 def covered(solids: Sequence[Solid], cell_keys: Keys, voxel_size: float) -> NDArray[np.bool_]:
-    """Return which cells lie wholly inside the union of solids: all eight corners and the centre are in some solid.
+    """Return which cells are wholly inside the union of solids: all eight corners and the centre are in some solid.
 
-    Such cells hold the faces where two solids touch, which are invisible.
+    Such cells contain the invisible faces between touching solids.
     """
     probes = np.concatenate([_OCTANTS, [[0.5, 0.5, 0.5]]])
     cell = indices(cell_keys)

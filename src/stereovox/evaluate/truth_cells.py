@@ -21,7 +21,7 @@ from stereovox.maps.storage.cubes import in_cubes
 _STEPS: tuple[int, ...] = tuple((keys(np.eye(3, dtype=int)) - keys([0, 0, 0])).tolist())
 """Difference of keys by one cell along x, y and z."""
 _FARTHEST_BLOCK = 1 << 17
-"""Keys cannot hold blocks beyond."""
+"""Keys cannot represent blocks beyond this."""
 MAX_TOLERANCE = 20
 _LEAST_REACH = 2
 """Cells around a surface that are always read, whatever the tolerance."""
@@ -67,13 +67,13 @@ class Neighbourhood:
         self.cells, self.around, self.reach = cells, cells, reach
         self._tables: list[NDArray[np.int64]] = []
         steps = np.arange(-reach, reach + 1)
-        for step in _STEPS:  # one axis after the other: three short tables instead of one of (2 reach + 1)^3
+        for step in _STEPS:  # axis by axis: three short tables instead of one of (2 reach + 1)^3
             near = self.around[:, None] + step * steps
             self.around = np.unique(near)
             self._tables.append(np.searchsorted(self.around, near))
 
     def within(self, tolerance: int) -> NDArray[np.bool_]:
-        """Return which cells of `around` (D,) lie within `tolerance` cells, at most the reach, of the set."""
+        """Return which cells of `around` (D,) are within `tolerance` cells, at most the reach, of the set."""
         inside = np.ones(len(self.cells), bool)
         for table in self._tables:
             near = self._columns(table, tolerance)[inside]
@@ -88,11 +88,11 @@ class Neighbourhood:
         return values
 
     def spread(self, tolerance: int) -> NDArray[np.float64]:
-        """Return the covariance (S, 3, 3), in cells squared, of those cells of the set within `tolerance` of each."""
+        """Return the covariance (S, 3, 3), in cells squared, of the set's cells within `tolerance` of each."""
         inside = position(self.around, self.cells) >= 0
         steps = np.arange(-tolerance, tolerance + 1.0)
         sums: dict[tuple[int, ...], NDArray[np.float64]] = {(): inside.astype(float)}
-        for axis in (2, 1, 0):  # sums of 1, of each offset and of each product of two, one axis after the other
+        for axis in (2, 1, 0):  # sums of 1, of each offset and of each product of two, axis by axis
             table = self._columns(self._tables[axis], tolerance)
             more = [(axes, n) for axes in sums for n in range(3 - len(axes))]
             sums = {(*[axis] * n, *axes): sums[axes][table] @ steps**n for axes, n in more}
@@ -109,9 +109,9 @@ class Neighbourhood:
 class Reading:
     """Values of a map in the cells of the truth and around its surfaces.
 
-    log_odds: (N,) float32 of each cell of the truth, 0 where unobserved; states: (N,) uint8, the `State` that the map
-    itself gives each. around, around_states: the same (D,) of all cells near a surface. neighbourhood: which those are;
-    surface: which of its cells are the S truly occupied ones that count. tolerance: of the truth.
+    log_odds: (N,) float32 of each cell of the truth, 0 if unobserved; states: (N,) uint8, the `State` that the map
+    itself gives each. around, around_states: the same (D,) of all cells near a surface. neighbourhood: these cells;
+    surface: the indices in it of the S truly occupied cells that count. tolerance: of the truth.
     """
 
     log_odds: NDArray[np.float32]
@@ -129,12 +129,12 @@ class Reading:
 
     @property
     def probability(self) -> NDArray[np.float64]:
-        """Probability (N,) that each cell is occupied, 0.5 where unobserved."""
+        """Probability (N,) that each cell is occupied, 0.5 if unobserved."""
         return 1 / (1 + np.exp(-self.log_odds.astype(float)))
 
     @cached_property
     def best(self) -> NDArray[np.float32]:
-        """For each truly occupied cell (S,) the highest log-odds within the tolerance, -inf where all is unobserved."""
+        """For each truly occupied cell (S,) the highest log-odds within the tolerance, -inf if all are unobserved."""
         return self.best_within(self.tolerance)
 
     def best_within(self, tolerance: int) -> NDArray[np.float32]:
@@ -162,12 +162,12 @@ class Reading:
 
 
 class TruthCells:
-    """The cells of a truth map that count, and what lies within `tolerance` cells of its surfaces.
+    """The relevant cells of a truth map, and the cells within `tolerance` cells of its surfaces.
 
-    truth_map: its occupied cells hold a surface, its free cells were in view and hold none; all others, tentative ones
-    too, do not count. map: the same in cubes. cells: ascending keys (N,) of those that count; occupied: (N,) which of
-    them hold a surface; near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the
-    occupied ones; counted: (S,) which of its cells are those of `occupied`, all but in a `part`. Distances count along
+    truth_map: its occupied cells have a surface, its free cells were in view and have none; all others, including
+    tentative ones, are ignored. map: the same in cubes. cells: ascending keys (N,) of the relevant ones; occupied: (N,)
+    those with a surface; near: (N,) those with a surface within the tolerance; neighbourhood: the cells around the
+    occupied ones; counted: (S,) those of its cells in `occupied`: all, except in a `part`. Distances count along
     each axis: diagonal neighbours are one cell away. Raises StereovoxError for a truth without such cells and an
     invalid tolerance.
     """
@@ -193,7 +193,7 @@ class TruthCells:
         self.counted = np.arange(len(self.neighbourhood.cells))
 
     def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
-        """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
+        """Return the truth of the `chosen` cells (N,) alone; cells near them count as near, chosen or not.
 
         Raises StereovoxError if none is chosen.
         """
@@ -210,7 +210,7 @@ class TruthCells:
         return position(self.cells, around) >= 0
 
     def read(self, voxel_map: VoxelMap) -> Reading:
-        """Read `voxel_map`. Raises StereovoxError if its cells are not those of the truth."""
+        """Read `voxel_map`. Raises StereovoxError if its cell size differs from the truth's."""
         voxel_map = in_cubes(voxel_map)
         if not np.allclose(voxel_map.voxel_size, self.voxel_size, rtol=1e-5, atol=0):
             raise StereovoxError(

@@ -17,11 +17,11 @@ __all__ = ["State", "VoxelMap", "load_map", "make_map", "save_boxed", "unbounded
 
 
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
-    """Return the map that `config` asks for: unbounded, or in a window that moves with the camera, or within
-    `max_memory`, or on a graphics card.
+    """Return the map for `config`: unbounded, or in a window that moves with the camera, or within `max_memory`, or on
+    a graphics card.
 
-    resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default; it is not
-    there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean, and when
+    resume: a map to continue. tiles: folder for the cells that leave a window, a temporary one by default; it is not
+    there if this raises. Raises ConfigError if the settings would change the meaning of `resume`'s cells, or if
     something does not fit into `max_memory`.
     """
     if config.dimensions == 2:
@@ -31,7 +31,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
     kept = _kept_frames(config, resume)
     if resume is not None:
         resume.storage.check_can_grow()
-        resume.storage.check_cells(config)  # before anything lies on the disk
+        resume.storage.check_cells(config)  # before anything is written to disk
     try:
         made = _made(config, resume, tiles)
         made.storage.kept = kept
@@ -41,7 +41,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
 
 
 def _kept_frames(config: Config, resume: VoxelMap | None) -> KeptFrames | None:
-    """Return where frames are kept, those of `resume` among them. Raises ConfigError if it did not keep its own."""
+    """Return the store of kept frames, including those of `resume`. Raises ConfigError if `resume` kept none."""
     if not config.map.keep_frames:
         return None
     if resume is None:
@@ -82,7 +82,7 @@ def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
 
 
 def _continued(resume: VoxelMap, config: Config) -> VoxelMap:
-    """Return the map itself with the settings of the run that goes on; a copy of one with bounds or elsewhere."""
+    """Return the map itself with the new run's settings; a copy if it is bounded or not in memory."""
     if type(resume.storage) is not Storage:
         return unbounded(resume, config)
     resume.storage.continue_with(config)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels over tiles of 64x64 cells: add evidence, look cells up, show them as one picture."""
+"""Kernels over tiles of 64x64 cells: add evidence, look cells up, draw them as one picture."""
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from stereovox.maps.cells._cells import added, find, find_or_insert
 def add_tiles(table, coords, count, cells, wanted, values, unknown, prior, lowest, highest):
     """Add `values` (n, 4096) to tiles `wanted` (n, 3) with clamping; return how many cells changed.
 
-    As `_add.add` does for blocks: a tile whose values are all zero is not made, cells without evidence start from
-    `prior`, and a sum of just `unknown` is stored as one more.
+    Like `_add.add` for blocks: a tile whose values are all zero is not created, cells without evidence start from
+    `prior`, and a sum of exactly `unknown` is stored as one more.
     """
     changed = 0
     for i in range(wanted.shape[0]):
@@ -46,7 +46,7 @@ def _add_row(cells, value, unknown, prior, lowest, highest):
 
 @kernel
 def look_up(table, coords, cells, indices, out):
-    """Write the number of each cell (column, row) of `indices` (n, 2) int64 to `out` (n,), left as it is without."""
+    """Write the number of each cell (column, row) of `indices` (n, 2) int64 to `out` (n,), unchanged without a tile."""
     for i in range(indices.shape[0]):
         x, y = indices[i, 0], indices[i, 1]
         tile = find(table, coords, x >> 6, y >> 6, 0)
@@ -56,7 +56,7 @@ def look_up(table, coords, cells, indices, out):
 
 @kernel
 def show(coords, cells, first_column, first_row, shown, lowest, picture):
-    """Write what all tiles `cells` (n, 4096) show, by the table `shown` that begins with `lowest`, to `picture`."""
+    """Write all tiles `cells` (n, 4096) to `picture`, converted by the table `shown`, which starts at `lowest`."""
     rows, columns = picture.shape
     for i in range(coords.shape[0]):
         left, bottom = (coords[i, 0] << 6) - first_column, (coords[i, 1] << 6) - first_row
@@ -65,6 +65,4 @@ def show(coords, cells, first_column, first_row, shown, lowest, picture):
             start = ((row - bottom) << 6) + column - left
             stored, out = cells[i, start : start + until - column], picture[row, column:until]
             for k in range(out.size):
-                out[k] = shown[
-                    np.uint32(np.int32(stored[k]) - lowest)
-                ]  # unsigned: no test whether it counts from the end
+                out[k] = shown[np.uint32(np.int32(stored[k]) - lowest)]  # unsigned: no test for negative indices

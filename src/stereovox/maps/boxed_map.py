@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps in boxes: opened without being loaded, and made of other maps."""
+"""Maps in boxes: opened without loading, and made from other maps."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from stereovox.maps.storage.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, w
 from stereovox.maps.voxel_map import VoxelMap, unbounded
 
 USUAL_SIDE = 256
-"""Cells along the side of a box if none is asked for."""
+"""Cells along the side of a box by default."""
 OURS = (f"{BOXES}/", MANIFEST, LOCK, ".writer")
-"""Beginnings of the names of all files of a map in boxes."""
+"""Prefixes of the names of all files of a map in boxes."""
 
 
 class BoxedMap(VoxelMap):
-    """A map in boxes, in a folder or an object store, that is used without being loaded.
+    """A map in boxes, in a folder or an object store, used without loading it.
 
-    Every question of `VoxelMap` gets the same answer as from a map in memory. Only the boxes it needs are read, and
-    those asked for last are kept in a cache of bounded size; a single ray, box or capsule that needs more than the
-    cache holds is refused with the cure. `counts` and `bounds` read nothing. Nothing can be added to it.
+    Every `VoxelMap` query gives the same answer as on a map in memory. Only the boxes it needs are read, and recently
+    used ones stay in a cache of bounded size; a single ray, box or capsule that needs more than the cache holds is
+    refused with the cure. `counts` and `bounds` read nothing. Nothing can be added to it.
     """
 
     storage: BoxedStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
@@ -51,12 +51,12 @@ class BoxedMap(VoxelMap):
 
     @property
     def manifest(self) -> BoxedManifest:
-        """Which boxes there are, and the levels of the pyramid."""
+        """The map's boxes, and the levels of the pyramid."""
         return self.storage.manifest
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes that the whole map would take in memory, about; the cache takes no more than its size."""
+        """Approximate bytes of the whole map in memory; the cache stays within its own size."""
         return self.storage.bytes_of_all
 
     def counts(self) -> dict[str, int]:
@@ -69,25 +69,23 @@ class BoxedMap(VoxelMap):
         return np.stack(bounds_of(self.manifest.boxes)) * self.config.cell if self.manifest.boxes else None
 
     def overview(self, most: int = 4_000_000) -> VoxelMap:
-        """Return the whole map in memory, in cells so large that about `most` of them are known; see `VoxelMap`.
+        """Return the whole map in memory, in cells large enough that about `most` are known; see `VoxelMap`.
 
         Args:
-            most: Known cells that may be loaded for it.
+            most: Most known cells to load.
 
         Returns:
             The map of one level of the pyramid, with the history of this one.
 
         Raises:
-            StereovoxError: Even the coarsest level holds far more.
+            StereovoxError: Even the coarsest level has far more.
             MapFileError: A box is missing or damaged.
         """
         levels = [self.manifest.boxes, *self.manifest.levels]
         known = [sum(entry.known for entry in level) for level in levels]
         level = next((n for n, cells in enumerate(known) if cells <= most), len(levels) - 1)
         if known[level] > max(4 * most, 1_000_000):
-            raise StereovoxError(
-                f"{self.storage.place}: has no level that is coarse enough to show; cut it into boxes anew"
-            )
+            raise StereovoxError(f"{self.storage.place}: has no level coarse enough to show; cut it into boxes again")
         if level == 0:
             return unbounded(self)
         layout = self.manifest.layout_of(level)
@@ -106,7 +104,7 @@ class BoxedMap(VoxelMap):
     ) -> RayHits:
         """Find where rays stop, box by box along them; see `VoxelMap.cast_rays`."""
         stop_at = _as_list(stop_at)
-        number = len(queries.cast_rays(self._asked, origins, directions, 0.0, stop_at).distance)  # checks them
+        number = len(queries.cast_rays(self._asked, origins, directions, 0.0, stop_at).distance)  # validates the input
         hits, longest = RayHits.none(number), queries.distance_of(max_distance)
         starts, ways = (np.array(queries.points_of(values), float) for values in (origins, directions))
         starts = np.broadcast_to(starts, ways.shape)
@@ -128,7 +126,7 @@ class BoxedMap(VoxelMap):
 
     def check_boxes(self, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
         """Return the worst state in boxes; see `VoxelMap.check_boxes`."""
-        number = len(queries.check_boxes(self._nothing, low, high))  # checks them
+        number = len(queries.check_boxes(self._nothing, low, high))  # validates the input
         lows, highs = (np.array(queries.points_of(values), float) for values in (low, high))
         worst = np.empty(number, np.uint8)
         for part in self._parts(lows, highs):
@@ -137,7 +135,7 @@ class BoxedMap(VoxelMap):
 
     def check_capsules(self, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
         """Return the worst state that capsules touch; see `VoxelMap.check_capsules`."""
-        number = len(queries.check_capsules(self._nothing, start, end, radius))  # checks them
+        number = len(queries.check_capsules(self._nothing, start, end, radius))  # validates the input
         starts, ends = (np.array(queries.points_of(values), float) for values in (start, end))
         reach = np.broadcast_to(np.atleast_1d(np.asarray(radius, float)), number)
         worst = np.empty(number, np.uint8)
@@ -149,9 +147,9 @@ class BoxedMap(VoxelMap):
     def nearest_obstacle(
         self, points: ArrayLike, max_distance: float = np.inf, obstacles: Iterable[State] = (State.OCCUPIED,)
     ) -> NearestCells:
-        """Find the nearest cell that is an obstacle, farther and farther away; see `VoxelMap.nearest_obstacle`."""
+        """Find the nearest obstacle cell, in growing radii; see `VoxelMap.nearest_obstacle`."""
         obstacles = _as_list(obstacles)
-        number = len(queries.nearest(self._nothing, points, 0.0, obstacles).distance)  # checks them
+        number = len(queries.nearest(self._nothing, points, 0.0, obstacles).distance)  # validates the input
         nearest, longest = NearestCells.none(number), queries.distance_of(max_distance)
         places = np.array(queries.points_of(points), float)
         last = np.minimum(self._farthest(places), longest)
@@ -168,7 +166,7 @@ class BoxedMap(VoxelMap):
         return nearest
 
     def _repr_html_(self, title: str | None = None) -> str:
-        """Return what a notebook shows: a picture of the whole in coarse cells."""
+        """Return the notebook view: a picture of the whole map in coarse cells."""
         return self.overview()._repr_html_(title or type(self).__name__)
 
     @property
@@ -177,15 +175,15 @@ class BoxedMap(VoxelMap):
 
     @property
     def _nothing(self) -> QueryTarget:
-        """A map of no cells, of which questions are asked only to check them."""
+        """An empty map, queried only to validate input."""
         return VoxelMap(self.config)._asked
 
     def _parts(
         self, low: NDArray[np.float64], high: NDArray[np.float64], states: list[State] | None = None
     ) -> Iterator[NDArray[np.int64]]:
-        """Yield items (m,) as `BoxedStorage.parts` does, by what they need in metres (N, 3), one cell more.
+        """Yield items (m,) as `BoxedStorage.parts` does, for extents in metres (N, 3), padded by one cell.
 
-        states: those that matter; boxes without them are left out. None: all do, UNKNOWN as well.
+        states: the relevant ones; boxes without them are skipped. None: all, including UNKNOWN.
         """
         cell = np.array(self.config.cell)
         first, last = np.floor(low / cell) - 1, np.floor(high / cell) + 1
@@ -194,9 +192,9 @@ class BoxedMap(VoxelMap):
         return self.storage.parts(first, last, _holding(states))
 
     def _exits(self, starts: NDArray[np.float64], units: NDArray[np.float64], through: bool) -> NDArray[np.float64]:
-        """Return how far along (N,) rays can meet a known cell, and if not `through` unknown ones the next after it.
+        """Return the length (N,) along rays to the last known cell, and if not `through`, to the unknown one after it.
 
-        -1 where a ray meets none.
+        -1 if a ray meets none.
         """
         beside = 3 * max(self.config.cell)
         bounds = self.bounds()
@@ -213,7 +211,7 @@ class BoxedMap(VoxelMap):
         return leaves if through else np.maximum(leaves, 0) + beside
 
     def _farthest(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (N,) the farthest known cell can be; a little more, so that an unknown one lies before it."""
+        """Return the largest distance (N,) of any known cell, plus a margin that includes an unknown one."""
         bounds = self.bounds()
         if bounds is None:
             return np.zeros(len(places))
@@ -221,12 +219,12 @@ class BoxedMap(VoxelMap):
 
 
 def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | None = None) -> BoxedMap:
-    """Save a map in boxes, with a pyramid of coarser levels; an older one there stays whole until this is complete.
+    """Save a map in boxes, with a pyramid of coarser levels; an older map there stays intact until this is complete.
 
     The depth images of a map that keeps them are not saved with it.
 
     Args:
-        voxel_map: The map, which must not change meanwhile.
+        voxel_map: The map, which must not change during the call.
         where: Folder, or URL in an object store (`s3://bucket/city.svox`).
         box_m: Side of a box in metres, rounded up to whole blocks of 8 cells; None: 256 cells.
 
@@ -234,8 +232,8 @@ def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | No
         The map in boxes.
 
     Raises:
-        MapFileError: It cannot be written, or something else is there, or another run writes it.
-        StereovoxError: Boxes of `box_m` are too large or none.
+        MapFileError: It cannot be written, something else is there, or another run is writing it.
+        StereovoxError: `box_m` is too large or not positive.
         MissingExtra: A URL is given, and obstore is not installed.
     """
     place = Place.of(where)
@@ -262,17 +260,19 @@ def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | No
 
 
 def check_boxed_target(place: Place, ours: tuple[str, ...] = ()) -> None:
-    """Raise MapFileError if a place holds anything but a map in boxes, or what a killed writer left of one.
+    """Raise MapFileError if a place holds anything but a map in boxes, or the remains of one from a killed writer.
 
-    ours: beginnings of the names of other files that belong to it.
+    ours: prefixes of the names of other files that belong to it.
     """
     other = next((name for name in place.names() if not name.startswith((*OURS, *ours))), None)
     if other is not None:
-        raise MapFileError(f"{place}: holds {other}, which is not of a map in boxes; choose another name or remove it")
+        raise MapFileError(
+            f"{place}: holds {other}, which is no part of a map in boxes; choose another name or remove it"
+        )
 
 
 def side_of(box_m: float | None, cell: tuple[float, float, float]) -> int:
-    """Return the side of a box in cells; raises StereovoxError for none and for one that is too large."""
+    """Return the side of a box in cells; raises StereovoxError if it is not positive or too large."""
     if box_m is None:
         return USUAL_SIDE
     most = MAX_SIDE * min(cell)
@@ -286,7 +286,7 @@ def _as_list(states: Iterable[State]) -> list[State]:
 
 
 def _holding(states: list[State] | None) -> Wanted:
-    """Return what reports whether a box may hold a cell in one of these states."""
+    """Return a test of whether a box may contain a cell in one of these states."""
     if states is None or State.UNKNOWN in states:
         return any_box
     return lambda box: any(getattr(box, State(state).name.lower()) for state in states)

@@ -32,17 +32,17 @@ from stereovox.maps.storage.storage import OnStorage
 FORMAT, VERSION = "stereovox-grid", 2
 PARTS = ("about", "coords", "cells")
 MAX_PICTURED = 2**29
-"""Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
+"""Cells of the largest picture; the map itself stores only known tiles and may extend farther."""
 
 
 class GridStorage(Guarded):
     """The tiles of a grid in memory.
 
     Attributes:
-        lock: Held by each call, and by those of the map.
+        lock: Held during each call, and each call of the map.
         config: The settings.
-        history: What the map remembers of its scans and images.
-        rules: What stored numbers mean.
+        history: The map's record of its scans and images.
+        rules: Meaning of stored numbers.
         cell_format: How log-odds are stored.
     """
 
@@ -56,7 +56,7 @@ class GridStorage(Guarded):
         self._pool = BlockPool(self.cell_format.dtype, capacity=64, fill=self.cell_format.unknown, cells=CELLS)
 
     def continue_with(self, config: Config) -> None:
-        """Take over the settings of a run that goes on; raises ConfigError if they change what the cells mean."""
+        """Adopt the settings of a run that continues the map; raises ConfigError if they change the cells' meaning."""
         for name in ("voxel_size", "map", "grid.prior"):
             old, new = (attrgetter(name)(settings) for settings in (self.config, config))
             if old != new:
@@ -66,16 +66,16 @@ class GridStorage(Guarded):
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole tiles: coordinates (n, 3) x, y, 0; cells (n, 4096) as stored, at least one of each tile known.
 
-        What stood there before is lost.
+        Earlier content is lost.
         """
         places = self._pool.insert(coords)
         known = np.clip(cells, self.rules.lowest, self.rules.highest)
         self._pool.values[places] = np.where(cells == self.cell_format.unknown, self.cell_format.unknown, known)
 
     def check_room(self, evidence: GridEvidence) -> None:
-        """Raise FrameRefused `memory_full` where `evidence` needs more memory than `max_memory`.
+        """Raise FrameRefused `memory_full` if `evidence` needs more memory than `max_memory`.
 
-        A third of that may hold tiles: where their pool grows, the old one and one twice as large stand side by side.
+        Tiles may take a third of that: while their pool grows, the old and a doubled one exist together.
         """
         if self.config.max_memory is None:
             return
@@ -114,11 +114,11 @@ class GridStorage(Guarded):
 
     @property
     def values(self) -> NDArray[np.integer]:
-        """Cells (n, 4096) of all tiles as they are stored, in no order; valid until the map changes."""
+        """Cells (n, 4096) of all tiles as stored, in no order; valid until the map changes."""
         return self._pool.values[: len(self._pool)]
 
     def tiles(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return tile coordinates (n, 3) x, y, 0 in ascending order and their cells (n, 4096) as they are stored."""
+        """Return tile coordinates (n, 3) x, y, 0 in ascending order and their cells (n, 4096) as stored."""
         n = len(self._pool)
         order = np.lexsort(self._pool.coords[:n].T[::-1])
         return self._pool.coords[order], self._pool.values[order]
@@ -130,7 +130,7 @@ class GridStorage(Guarded):
             return None
         tiles = self._pool.coords[:n, :2].astype(np.int64)
         box = np.stack([tiles.min(axis=0), tiles.max(axis=0)])
-        for end, axis in np.ndindex(2, 2):  # every tile has a known cell, so those at the rim decide
+        for end, axis in np.ndindex(2, 2):  # every tile has a known cell, so the outermost decide
             rim = np.flatnonzero(tiles[:, axis] == box[end, axis])
             known = (self._pool.values[rim] != self.cell_format.unknown).reshape(-1, SIDE, SIDE)
             there = np.flatnonzero(known.any(axis=(0, 1 + axis)))
@@ -149,11 +149,11 @@ class GridStorage(Guarded):
 
 
 class GridMap(Guarded, OnStorage):
-    """A sparse 2-D occupancy map: tiles of 64x64 cells, made where a scan says something.
+    """A sparse 2-D occupancy map: tiles of 64x64 cells, created on demand.
 
-    Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, which stands at
-    `origin` in the map's. Points and poses are in the map's frame. Cells, their states and the settings `config.map`
-    mean what they do in a `VoxelMap`, but for the prior: that is `config.grid.prior`.
+    Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, whose pose in the
+    map's frame is `origin`. Points and poses are in the map's frame. Cells, their states and the settings `config.map`
+    mean the same as in a `VoxelMap`, except the prior: that is `config.grid.prior`.
 
     Several threads may use a map: each call holds its `lock`.
 
@@ -162,12 +162,12 @@ class GridMap(Guarded, OnStorage):
         origin: (3,) x, y in metres and yaw in radians of the grid's frame in the map's.
 
     Raises:
-        StereovoxError: `origin` is of another shape.
+        StereovoxError: `origin` has another shape.
 
     Attributes:
         lock: Re-entrant; hold it over several calls that must see the same state.
         origin: As given, float64.
-        storage: The tiles as they are stored, for programs that read or write whole tiles.
+        storage: The stored tiles, for programs that read or write whole tiles.
     """
 
     storage: GridStorage
@@ -182,10 +182,10 @@ class GridMap(Guarded, OnStorage):
 
     @classmethod
     def from_occupancy(cls, grid: OccupancyGrid, config: Config) -> GridMap:
-        """Make a map to go on with.
+        """Make a map from a grid, to continue it.
 
         Args:
-            grid: The cells, and the frame that the map keeps. 0 and 100 per cent become the surest cells that
+            grid: The cells, and the frame that the map keeps. 0 and 100 per cent become the most certain cells that
                 `config.map` allows.
             config: The settings.
 
@@ -217,7 +217,7 @@ class GridMap(Guarded, OnStorage):
         """Add the evidence of one scan.
 
         Args:
-            evidence: What the beams of a scan say.
+            evidence: Evidence of a scan's beams.
 
         Returns:
             The number of cells whose value changed.
@@ -231,7 +231,7 @@ class GridMap(Guarded, OnStorage):
             points: (N, 2) in metres, or (2,) for one.
 
         Returns:
-            (N,) float32; 0 where unknown or not finite.
+            (N,) float32; 0 if unknown or not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -245,7 +245,7 @@ class GridMap(Guarded, OnStorage):
             points: (N, 2) in metres, or (2,) for one.
 
         Returns:
-            (N,) float32; 0.5 where unknown or not finite.
+            (N,) float32; 0.5 if unknown or not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -259,7 +259,7 @@ class GridMap(Guarded, OnStorage):
             points: (N, 2) in metres, or (2,) for one.
 
         Returns:
-            (N,) uint8; UNKNOWN where not finite.
+            (N,) uint8; UNKNOWN if not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -291,7 +291,7 @@ class GridMap(Guarded, OnStorage):
         return self._described((self.config.voxel_size,), self.counts(), self.memory_bytes)
 
     def _repr_html_(self, title: str | None = None) -> str:
-        """Return what a notebook shows: a small picture from above, and facts. title: by default the class's name."""
+        """Return the notebook view: a small picture from above, and facts. title: by default the class's name."""
         from stereovox.maps.notebook import card, facts_of, floor_from_above
 
         with self.lock:
@@ -309,7 +309,7 @@ class GridMap(Guarded, OnStorage):
     def bounds(self) -> NDArray[np.float64] | None:
         """Return the lowest and highest corner (2, 2) in metres of all known cells; None for an empty map.
 
-        In the grid's own frame, which is the map's where `origin` is 0, 0, 0.
+        In the grid's own frame, which is the map's if `origin` is 0, 0, 0.
         """
         box = self.storage.box()
         return None if box is None else np.asarray(box * self.voxel_size, float)
@@ -317,7 +317,7 @@ class GridMap(Guarded, OnStorage):
     def occupancy(self) -> OccupancyGrid:
         """Return all known cells as per cent, in a picture just large enough; no cells at all for an empty map.
 
-        Cells are of the same state here and there (see `Percent`). Raises StereovoxError for more than MAX_PICTURED.
+        Cells keep their state (see `Percent`). Raises StereovoxError for more than MAX_PICTURED.
         """
         box = self.storage.box()
         (left, bottom), (right, top) = np.zeros((2, 2), int).tolist() if box is None else box.tolist()
@@ -377,7 +377,7 @@ class GridMap(Guarded, OnStorage):
 def save_grid(grid_map: GridMap, path: str | Path) -> None:
     """Write `grid_map` to the file `path`, all or nothing.
 
-    Raises MapFileError, one line, where that cannot be or another run is writing it.
+    Raises MapFileError, one line, if that fails or another run is writing it.
     """
     coords, cells = grid_map.storage.tiles()
     about = np.frombuffer(sealed({**_about(grid_map), "checksum": _checksums(coords, cells)}), np.uint8)
@@ -402,7 +402,7 @@ def load_grid(path: str | Path) -> GridMap:
         if not np.isfinite(grid_map.origin).all() or coords[:, 2].any() or (np.abs(coords) > 1 << 24).any():
             raise ValueError("tiles or origin out of range")
         if not (cells != grid_map.storage.cell_format.unknown).any(axis=1).all():
-            raise ValueError("a tile without a known cell")
+            raise ValueError("a tile has no known cell")
         if _checksums(coords, cells) != about["checksum"]:
             raise ValueError("the cells do not match their checksum")
         grid_map.storage.insert(coords, cells)
@@ -410,9 +410,9 @@ def load_grid(path: str | Path) -> GridMap:
         raise
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except Exception as error:  # what a damaged file can raise in zipfile, zlib, NumPy and JSON is not bounded
+    except Exception as error:  # a damaged file can raise anything in zipfile, zlib, NumPy and JSON
         why = " ".join(str(error).split()) or type(error).__name__
-        raise MapFileError(f"{path}: no grid that can be read ({why}); save it anew") from None
+        raise MapFileError(f"{path}: not a readable grid ({why}); save it again") from None
     return grid_map
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map shows of itself in a notebook: a small picture from above and a few facts, as HTML without other files.
+"""The notebook view of a map: a small picture from above and a few facts, as self-contained HTML.
 
-Arrays come in, so that voxel maps, grids and mappers can all call it. It is made for speed: a few passes over the cells
-and no matplotlib, which `view/` has for pictures that are saved.
+It takes arrays, so that voxel maps, grids and mappers can all call it. It is fast: a few passes over the cells and no
+matplotlib, which `view/` uses for saved pictures.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from stereovox.maps.storage.memory import format_bytes
 from stereovox.maps.upright import ceiling, turned, turned_cells
 
 SIZE_PX = 400
-"""Longer side of a picture at most; smaller maps are enlarged by a whole factor."""
+"""Longest side of a picture; smaller maps are enlarged by a whole factor."""
 MAX_PNG = 100_000
-"""Bytes of a picture; a larger one is halved."""
+"""Most bytes of a picture; a larger one is halved."""
 MAX_FLOOR = 2**26
-"""Cells of a floor's rectangle that are drawn at most: 64 MB."""
+"""Most cells of a floor's rectangle that are drawn: 64 MB."""
 EMPTY = "This map is empty: no cell is known yet."
 MAX_REASONS = 4
-"""Reasons of refusals that are named."""
+"""Most reasons of refusals that are named."""
 RELIEF = 0.3
-"""Largest part by which a step in height brightens or darkens a pixel."""
+"""Largest share by which a step in height brightens or darkens a pixel."""
 _HEIGHTS = np.array([[105, 70, 130], [95, 115, 165], [75, 165, 160], [130, 210, 125], [253, 236, 85]], float)
 """Colours of heights from low to high, evenly spaced: viridis, paler, so that light and shade show."""
 _STATES = np.array([[0, 0, 0, 0], [226, 224, 212, 255], [232, 163, 61, 255], [34, 48, 74, 255]], np.uint8)
 """RGBA of unknown (transparent), free, tentative and occupied."""
 _UNKNOWN_FLOOR = np.array([128, 134, 145, 110], np.uint8)
-"""RGBA of unknown cells of a floor, whose walls must show on a white page and on a black one."""
+"""RGBA of unknown cells of a floor, whose walls must be visible on white and black pages."""
 _PATH = (224, 69, 47, 255)
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
@@ -46,9 +46,9 @@ Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """Which pixels cells fall into: `low`, the lowest column and row; `step` cells a pixel; columns and rows of pixels.
+    """Mapping from cells to pixels: `low`, the lowest column and row; `step` cells a pixel; columns and rows of pixels.
 
-    Row 0 is the lowest: a picture is turned over before it is shown.
+    Row 0 is the lowest: a picture is flipped before it is shown.
     """
 
     low: NDArray[np.int64]
@@ -65,7 +65,7 @@ class Raster:
         return cls(low, step, (rows, columns))
 
     def places(self, cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return row and column of the pixels of cells (N, 2), which index a picture."""
+        """Return row and column in a picture of the pixels of cells (N, 2)."""
         column, row = ((cells - self.low) // self.step).T
         return row, column
 
@@ -131,8 +131,8 @@ def voxels_from_above(
 ) -> tuple[NDArray[np.uint8] | None, str]:
     """Return the picture (rows, columns, 4) RGBA of a voxel map from above, or None for an empty one, and its caption.
 
-    blocks: coordinates (n, 3) and cells (n, 512) as stored, whose `State` `states` returns. cell: sides in metres along
-    x, y and z. up: the axis of the map that points up.
+    blocks: coordinates (n, 3) and cells (n, 512) as stored, which `states` converts to `State`. cell: sides in metres
+    along x, y and z. up: the axis of the map that points up.
     """
     up = up.removeprefix("+")
     occupied, columns, free = _surfaces(blocks, states, up)
@@ -161,8 +161,8 @@ def floor_from_above(
 ) -> tuple[NDArray[np.uint8] | None, str]:
     """Return the picture (rows, columns, 4) RGBA of a floor, or None for an empty one, and its caption.
 
-    size: rows and columns. states: returns `State` (rows, columns), row 0 the lowest; of a pixel that stands for
-    several cells the one that matters most is shown.
+    size: rows and columns. states: returns `State` (rows, columns), row 0 the lowest; a pixel of several cells shows
+    the most important one.
     """
     rows, columns = (int(n) for n in size)
     if not rows * columns:
@@ -179,9 +179,9 @@ def floor_from_above(
 def _surfaces(
     blocks: Iterable[Blocks], states: Callable[[NDArray[np.integer]], NDArray[np.uint8]], up: str
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """Return occupied cells (N, 3) and known columns (M, 2), turned upright, and in which columns something is free.
+    """Return occupied cells (N, 3) and known columns (M, 2), turned upright, and which columns have a free cell.
 
-    A column may come several times.
+    A column may occur several times.
     """
     occupied, columns, free = [np.zeros((0, 3), np.int32)], [np.zeros((0, 3), np.int32)], [np.zeros(0, bool)]
     axis = 1 + "xyz".index(up[-1])
@@ -203,12 +203,12 @@ def _highest(
     """Return the highest of the values (N,) of the cells (N, 2) in each pixel, `empty` if there is none."""
     order = np.argsort(values, kind="stable")
     image = np.full(raster.shape, empty)
-    image[raster.places(cells[order])] = values[order]  # of equal places the last, the highest, stays
+    image[raster.places(cells[order])] = values[order]  # of equal places the last, the highest, wins
     return image
 
 
 def _relief(height: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return heights (rows, columns) in cells as RGBA, lit from the left and above; NaN is left as it comes."""
+    """Return heights (rows, columns) in cells as RGBA, lit from the left and above; NaN is left undefined."""
     low, high = np.nanmin(height), np.nanmax(height)
     share = (np.nan_to_num(height, nan=low) - low) / max(high - low, 1.0) * (len(_HEIGHTS) - 1)
     colours = np.stack([np.interp(share, np.arange(len(_HEIGHTS)), band) for band in _HEIGHTS.T], axis=-1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A finished 2-D map as plain numbers, as map_server serves it, AMCL localises in it and comparisons take it."""
+"""A finished 2-D map as plain numbers, for map_server, AMCL and comparisons."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNKNOWN = -1
 
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """A picture of a floor, in the meaning of `nav_msgs/OccupancyGrid`.
+    """A picture of a floor, with the meaning of `nav_msgs/OccupancyGrid`.
 
     Attributes:
         cells: (rows, columns) int8, probability of being occupied in per cent (0 to 100), -1 unknown. Row 0 is the
@@ -29,7 +29,7 @@ class OccupancyGrid:
         occupied_above: Probability above which a known cell counts as occupied.
 
     Raises:
-        StereovoxError: `cells` or `origin` is of another shape.
+        StereovoxError: `cells` or `origin` has another shape.
     """
 
     cells: NDArray[np.int8]
@@ -56,7 +56,7 @@ class OccupancyGrid:
 
     @property
     def known_span(self) -> tuple[slice, slice]:
-        """The rows and columns from the first to the last of which a cell is known; both empty if none is."""
+        """The range of rows and columns with known cells; both empty if there are none."""
         known = self.cells != UNKNOWN
         ends = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
         rows, columns = (slice(int(n[0]), int(n[-1]) + 1) if len(n) else slice(0, 0) for n in ends)
@@ -64,14 +64,14 @@ class OccupancyGrid:
 
     @property
     def known_corners(self) -> NDArray[np.float64]:
-        """Corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) if none is."""
+        """Corners (4, 2) x, y, in cells, of the bounding rectangle of known cells; (0, 2) if there are none."""
         rows, columns = self.known_span
         if rows.stop == rows.start:
             return np.zeros((0, 2))
         return np.array([(x, y) for x in (columns.start, columns.stop) for y in (rows.start, rows.stop)], float)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: a small picture from above, and facts."""
+        """Return the notebook view: a small picture from above, and facts."""
         from stereovox.maps.notebook import card, facts_of, floor_from_above
 
         known = self.states[self.known_span]
@@ -82,16 +82,16 @@ class OccupancyGrid:
         return card(type(self).__name__, facts, *floor_from_above(known.shape, lambda: known))
 
     def indices(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Return which cells hold points.
+        """Return the cells that contain points.
 
         Args:
-            points: (N, 2) x, y in metres, the map's frame.
+            points: (N, 2) x, y in metres, map frame.
 
         Returns:
             Row and column (N, 2) int64; they may lie outside the picture.
 
         Raises:
-            StereovoxError: `points` is of another shape.
+            StereovoxError: `points` has another shape.
         """
         local = se2.transform(se2.inverse(self.origin), points_of(points, axes=2))
         return np.floor(local[:, ::-1] / self.resolution).astype(np.int64)
@@ -104,10 +104,10 @@ class OccupancyGrid:
             columns: (N,)
 
         Returns:
-            (N, 2) x, y in metres, the map's frame.
+            (N, 2) x, y in metres, map frame.
 
         Raises:
-            StereovoxError: There are not as many rows as columns, or they are of another shape.
+            StereovoxError: Rows and columns differ in number, or have another shape.
         """
         if np.shape(rows) != np.shape(columns) or np.ndim(rows) > 1:
             raise shape_error("rows", rows, f"(N,), as many as columns, which are {np.shape(columns)}")
@@ -118,8 +118,8 @@ class OccupancyGrid:
 class Percent:
     """Stored numbers as per cent, by `rules`.
 
-    A cell is of the same state as a number and in per cent, for which rounding gives way. The surest cells that the
-    rules allow are 0 and 100 per cent, since many programs take nothing less for occupied.
+    A cell keeps its state in per cent, at the cost of rounding. The most certain cells that the rules allow are 0 and
+    100 per cent, because many programs accept nothing less as occupied.
     """
 
     def __init__(self, rules: CellRules):
@@ -129,7 +129,7 @@ class Percent:
 
     @cached_property
     def free_below(self) -> float:
-        """Probability below which cells are free: what evidence made likelier than the prior is not."""
+        """Probability below which cells are free: none that evidence made likelier than the prior is."""
         just_above = (self._rules.prior + 0.5 - self._format.unknown) / self._format.per_log_odds
         return min(self._rules.config.free_below, float(1 / (1 + np.exp(-just_above))))
 
@@ -140,7 +140,7 @@ class Percent:
 
     @cached_property
     def shown(self) -> NDArray[np.int8]:
-        """Per cent of each number that can be stored, from `lowest` on; -1 unknown."""
+        """Per cent of each storable number, from `lowest` on; -1 unknown."""
         stored = np.arange(self.lowest, np.iinfo(self._format.dtype).max + 1)
         states = self._rules.states(stored)
         free, occupied = 100 * self.free_below, 100 * self.occupied_above
@@ -157,7 +157,7 @@ class Percent:
         return percent.astype(np.int8)
 
     def stored(self, percent: NDArray[np.int8]) -> NDArray[np.integer]:
-        """Return what cells of so many per cent are stored as; less than 0 is unknown."""
+        """Return the stored numbers of cells given in per cent; less than 0 is unknown."""
         p = np.clip(np.arange(128) / 100, 1e-12, 1 - 1e-12)
         known = np.clip(self._format.stored(np.log(p / (1 - p))), self._rules.lowest, self._rules.highest)
         unknown = self._format.unknown

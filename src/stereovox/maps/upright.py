@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells turned so that their third axis points up, and where the ceiling above them begins."""
+"""Cells turned so that their third axis points up, and the ceiling above them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
-"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
+"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped if minus)."""
 SLAB = 1.6
 """A layer with this many times the cells of the median layer is a floor or a ceiling."""
 STRAY = 0.005
-"""This share of the cells at the bottom, and at the top, does not count for what layers usually hold: reflections."""
+"""This share of the cells at the bottom, and at the top, is ignored as reflections."""
 
 
 def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
@@ -31,8 +31,8 @@ def turned_cells(cells: NDArray[np.int32], up: str) -> NDArray[np.int32]:
 def ceiling(occupied: NDArray[np.int32]) -> int:
     """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
 
-    A ceiling is a layer in the upper part of the map, with and without its stray cells, that holds far more cells than
-    layers usually do.
+    A ceiling is a layer in the upper part of the map, with and without its stray cells, with far more cells than
+    usual layers.
     """
     if not len(occupied):
         return 0
@@ -55,6 +55,6 @@ def usual_layers(count: NDArray[np.int64]) -> tuple[int, int]:
 
 
 def layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:
-    """Return the lowest layer (third index) of cells (N, 3), N > 0, and the number of cells in each from there on."""
+    """Return the lowest layer (third index) of cells (N, 3), N > 0, and the number of cells in each from there up."""
     low = int(cells[:, 2].min())
     return low, np.bincount(cells[:, 2] - low)

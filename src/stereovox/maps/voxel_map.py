@@ -26,11 +26,11 @@ from stereovox.maps.storage.storage import OnStorage, Storage
 
 
 class OnBlocks(OnStorage):
-    """Attributes of a voxel map that its storage keeps."""
+    """Attributes of a voxel map kept in its storage."""
 
     @property
     def viewpoint(self) -> Viewpoint | None:
-        """Where the camera stood last; None before the first frame."""
+        """Last camera pose; None before the first frame."""
         return self.storage.viewpoint
 
     @viewpoint.setter
@@ -39,7 +39,7 @@ class OnBlocks(OnStorage):
 
     @property
     def kept_frames(self) -> KeptFrames | None:
-        """The depth images of its frames, where `map.keep_frames` asks for them; None if it has none."""
+        """The depth images of its frames if `map.keep_frames` is set; None if it has none."""
         return self.storage.kept
 
     @property
@@ -55,7 +55,7 @@ class OnBlocks(OnStorage):
 class VoxelMap(Guarded, OnBlocks):
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
 
-    Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` where its sides differ. A cell without
+    Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` if its sides differ. A cell without
     evidence is unknown: log-odds 0, probability 0.5. With evidence it is free (p < free_below), occupied
     (p > occupied_above) or tentative between them.
 
@@ -63,11 +63,11 @@ class VoxelMap(Guarded, OnBlocks):
 
     Args:
         config: The settings.
-        storage: Where its cells are kept; by default in memory, without bounds.
+        storage: Storage of its cells; by default in memory, without bounds.
 
     Attributes:
         lock: Re-entrant; hold it over several calls that must see the same state.
-        storage: The blocks as they are stored, for programs that read or write whole blocks.
+        storage: The stored blocks, for programs that read or write whole blocks.
     """
 
     storage: Storage
@@ -78,10 +78,10 @@ class VoxelMap(Guarded, OnBlocks):
 
     @classmethod
     def from_cells(cls, config: Config, indices: ArrayLike, log_odds: ArrayLike) -> VoxelMap:
-        """Make a map of these cells. A cell named twice keeps its last value.
+        """Make a map from cells. A cell named twice keeps its last value.
 
         Args:
-            config: The settings; log-odds are clamped as they say.
+            config: The settings; log-odds are clamped accordingly.
             indices: (N, 3) whole cell indices.
             log_odds: (N,); zero is stored as the smallest positive one.
 
@@ -89,7 +89,7 @@ class VoxelMap(Guarded, OnBlocks):
             The map, of no frames.
 
         Raises:
-            StereovoxError: The arrays are of other shapes, indices no whole numbers or too large, log-odds no numbers.
+            StereovoxError: The shapes are wrong, indices are not whole or too large, or log-odds are not numbers.
         """
         voxel_map = cls(config)
         rules, unknown = voxel_map.storage.rules, voxel_map.storage.cell_format.unknown
@@ -106,10 +106,10 @@ class VoxelMap(Guarded, OnBlocks):
         return voxel_map
 
     def snapshot(self) -> VoxelMap:
-        """Copy the map, to look at while it goes on: all cells, or those in its window.
+        """Copy the map, to inspect while it changes: all cells, or those in its window.
 
         Returns:
-            A map without bounds, with a lock of its own.
+            A map without bounds, with its own lock.
         """
         copy = VoxelMap(self.config)
         copy.storage.fill(self.storage, self.storage.in_memory())
@@ -119,7 +119,7 @@ class VoxelMap(Guarded, OnBlocks):
         """Add the evidence of one frame.
 
         Args:
-            evidence: What an integrator makes of a depth image.
+            evidence: An integrator's evidence from a depth image.
 
         Returns:
             The number of cells whose value changed.
@@ -127,10 +127,10 @@ class VoxelMap(Guarded, OnBlocks):
         return self.storage.add(evidence)
 
     def overview(self, most: int = 4_000_000) -> VoxelMap:
-        """Return a map in memory to draw the whole of: this one, or of a map in boxes a coarser one if it is large.
+        """Return a map in memory for drawing all of it: this one, or a coarser one of a large map in boxes.
 
         Args:
-            most: Known cells that may be loaded for it, about.
+            most: Approximate number of known cells that may be loaded.
 
         Returns:
             The map; a cell of a coarser one has the worst state of its parts.
@@ -144,7 +144,7 @@ class VoxelMap(Guarded, OnBlocks):
             points: (N, 3) in metres, world frame, or (3,) for one.
 
         Returns:
-            (N,) float32; 0 where unknown or not finite.
+            (N,) float32; 0 if unknown or not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -158,7 +158,7 @@ class VoxelMap(Guarded, OnBlocks):
             points: (N, 3) in metres, world frame, or (3,) for one.
 
         Returns:
-            (N,) float32; 0.5 where unknown or not finite.
+            (N,) float32; 0.5 if unknown or not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -172,7 +172,7 @@ class VoxelMap(Guarded, OnBlocks):
             points: (N, 3) in metres, world frame, or (3,) for one.
 
         Returns:
-            (N,) uint8; UNKNOWN where not finite.
+            (N,) uint8; UNKNOWN if not finite.
 
         Raises:
             StereovoxError: `points` is not numbers of such a shape.
@@ -187,7 +187,7 @@ class VoxelMap(Guarded, OnBlocks):
             now_ns: Time in nanoseconds; None: the stamp of the last frame.
 
         Returns:
-            (N,) float32 in seconds. NaN where the cell is unknown or was put in without a time; negative where the
+            (N,) float32 in seconds. NaN if the cell is unknown or was inserted without a time; negative if the
             evidence is stamped later than now.
 
         Raises:
@@ -223,8 +223,8 @@ class VoxelMap(Guarded, OnBlocks):
     ) -> RayHits:
         """Find where rays stop.
 
-        A ray begins in the cell that holds its origin and looks at every cell it crosses; one that it touches in an
-        edge only may count or not.
+        A ray begins in the cell that contains its origin and inspects every cell it crosses; a cell that it only
+        touches at an edge may or may not count.
 
         Args:
             origins: (N, 3) in metres, world frame, or (3,) for all rays.
@@ -243,8 +243,8 @@ class VoxelMap(Guarded, OnBlocks):
     def check_boxes(self, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
         """Return the worst state in boxes; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
 
-        A cell counts that holds a point of the box, faces included: what `state` would say of all points from low to
-        high.
+        A cell counts if it contains a point of the box, faces included: the result covers the `state` of all points
+        from low to high.
 
         Args:
             low: (N, 3) lowest corners in metres, world frame.
@@ -261,7 +261,7 @@ class VoxelMap(Guarded, OnBlocks):
     def check_capsules(self, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
         """Return the worst state that capsules touch; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
 
-        A cell counts that is no farther from the axis than the radius.
+        A cell counts if it is no farther from the axis than the radius.
 
         Args:
             start: (N, 3) beginnings of the axes in metres, world frame.
@@ -279,12 +279,12 @@ class VoxelMap(Guarded, OnBlocks):
     def nearest_obstacle(
         self, points: ArrayLike, max_distance: float = np.inf, obstacles: Iterable[State] = (State.OCCUPIED,)
     ) -> NearestCells:
-        """Find the nearest cell that is an obstacle.
+        """Find the nearest obstacle cell.
 
         Args:
             points: (N, 3) in metres, world frame, or (3,) for one.
-            max_distance: Metres; obstacles farther off count as none. By default the nearest one is found however far
-                it is; a limit makes the search quicker where obstacles are far.
+            max_distance: Metres; obstacles farther off are ignored. By default the nearest one is found however far
+                it is; a limit makes the search faster if obstacles are far.
             obstacles: States of cells that are obstacles; FREE is not allowed.
 
         Returns:
@@ -333,7 +333,7 @@ class VoxelMap(Guarded, OnBlocks):
         )
 
     def _repr_html_(self, title: str | None = None) -> str:
-        """Return what a notebook shows: a small picture from above, and facts. title: by default the class's name."""
+        """Return the notebook view: a small picture from above, and facts. title: by default the class's name."""
         from stereovox.maps.notebook import card, facts_of, voxels_from_above
 
         with self.lock:
@@ -364,10 +364,11 @@ class VoxelMap(Guarded, OnBlocks):
 
     @property
     def path(self) -> NDArray[np.float64]:
-        """Positions of the camera (N, 3) in metres, world frame, in the order of the frames; of several, one by one.
+        """Positions of the camera (N, 3) in metres, world frame, in the order of the frames; several cameras one after
+        another.
 
-        They are saved with the map and thinned evenly: at most 2048, 5 cm or 0.1 rad apart, farther on long paths.
-        (0, 3) for a map of no frames, such as an imported one.
+        Saved with the map and thinned evenly: at most 2048, 5 cm or 0.1 rad apart, farther on long paths.
+        (0, 3) for a map without frames, such as an imported one.
         """
         return np.concatenate([np.empty((0, 3)), *self.history.path.lines()])
 
@@ -378,11 +379,11 @@ class VoxelMap(Guarded, OnBlocks):
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes allocated: those in use, and room to grow (which the system gives when it is first used)."""
+        """Bytes allocated: in use, and room to grow (which the system provides on first use)."""
         return self.storage.reserved_bytes
 
     def save(self, path: str | Path) -> None:
-        """Save the map; an older one there stays whole until the new one is complete.
+        """Save the map; an older one there stays intact until the new one is complete.
 
         Args:
             path: The folder (Zarr inside).
@@ -409,7 +410,7 @@ class VoxelMap(Guarded, OnBlocks):
     def _where(
         self, chosen: Callable[[NDArray[np.integer]], NDArray[np.bool_]]
     ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return indices (N, 3) of the cells whose stored numbers are `chosen`, in ascending order, and these (N,)."""
+        """Return ascending indices (N, 3) of the cells whose stored numbers are `chosen`, and these numbers (N,)."""
         found = [cells_where(coords, values, chosen(values)) for coords, values in self.storage.slabs()]
         indices, stored = (np.concatenate(part) for part in zip(*found, strict=True))
         order = np.lexsort(indices.T[::-1])
@@ -417,9 +418,9 @@ class VoxelMap(Guarded, OnBlocks):
 
 
 def unbounded(voxel_map: VoxelMap, config: Config | None = None) -> VoxelMap:
-    """Return a map without bounds of all cells and what is known of them, with the settings `config` or its own.
+    """Return an unbounded map with all cells and their data, with the settings `config` or its own.
 
-    Raises ConfigError when these would change what its cells mean.
+    Raises ConfigError if these would change the meaning of its cells.
     """
     with voxel_map.lock:
         config = config or voxel_map.config
@@ -439,7 +440,7 @@ def cells_where(
 
 
 def _cells_of(indices: ArrayLike) -> NDArray:
-    """Return cell indices (N, 3); raises StereovoxError for another shape, but for [] and one cell (3,)."""
+    """Return cell indices (N, 3); raises StereovoxError for another shape, except [] and one cell (3,)."""
     if not (isinstance(indices, np.ndarray) and indices.dtype.kind in "iu"):
         return queries.points_of(indices, "indices", wanted="(N, 3) whole numbers")
     if indices.shape in {(0,), (3,)}:

@@ -112,7 +112,7 @@ def test_a_damaged_manifest_is_one_line(tmp_path, damage):
     before = manifest.read_bytes()
     manifest.write_bytes(damage(before))
     assert manifest.read_bytes() != before
-    with pytest.raises(MapFileError, match=r"make .* anew") as caught:
+    with pytest.raises(MapFileError, match=r"make .* again") as caught:
         load_map(tmp_path / "m")
     assert "\n" not in str(caught.value)
 

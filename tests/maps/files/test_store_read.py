@@ -113,10 +113,10 @@ def test_links_lead_nowhere(folder, tmp_path):
     chunk = arrays(folder) / "cells/c/0/0"
     chunk.rename(tmp_path / "elsewhere")
     chunk.symlink_to(tmp_path / "elsewhere")
-    assert "is a link or no file" in refusal(folder)
+    assert "is a link or not a file" in refusal(folder)
     chunk.unlink()
     os.mkfifo(chunk)
-    assert "is a link or no file" in refusal(folder)
+    assert "is a link or not a file" in refusal(folder)
     chunk.unlink()
     (tmp_path / "elsewhere").rename(chunk)
     load_map(folder)

@@ -116,7 +116,7 @@ def test_a_window_takes_what_there_is_and_no_more(when_full, outside, times):
 
 
 def test_a_window_that_cannot_be_is_one_line_with_its_cure():
-    with pytest.raises(ConfigError, match=r"holds the view needs .* allow more, or set a smaller max_range"):
+    with pytest.raises(ConfigError, match=r"covers the view needs .* allow more, or set a smaller max_range"):
         make_map(settings("1 MB", when_full="roll"))
     with pytest.raises(ConfigError, match=r"window of 20 x 20 x 20 m .* more than 1 MB; allow more max_memory"):
         make_map(settings("1 MB", **{"window.size": [20, 20, 20]}))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure in space: places that a camera saw again, and its way bent so that they are one."""
+"""Loop closure in space: finds revisited places, and corrects the trajectory so that they coincide."""

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel of the search for loops: how well points lie on a coarse grid, for all shifts within a window."""
+"""Kernel of the search for loops: scores of points on a coarse grid, for all shifts within a window."""
 
 from stereovox.kernels._jit import kernel
 
 
 @kernel
 def scores(grid, cells, found):
-    """Write to `found` (X, Z, Y) int32 the sum of `grid` over all cells, shifted by (x, y, z) less half the window.
+    """Write to `found` (X, Z, Y) int32 the sum of `grid` over all cells, shifted by (x, y, z) minus half the window.
 
-    grid: (I, K, J) int8; beyond it is 0. cells: (N, 3) int32. The sizes of `found` are odd. The second axis is last in
-    both, since windows are flat: whole rows of the grid are added to rows of the window.
+    grid: (I, K, J) int8; 0 beyond it. cells: (N, 3) int32. The sizes of `found` are odd. The second axis is last in
+    both, because windows are flat: whole rows of the grid are added to rows of the window.
     """
     half_x, half_z, half_y = found.shape[0] // 2, found.shape[1] // 2, found.shape[2] // 2
     for x in range(found.shape[0]):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure in space: finds where a camera came back, and bends its way so that what it saw twice is one.
+"""Loop closure in space: finds revisited places, and corrects the trajectory so that they coincide.
 
-The way is cut into submaps, which are taken as rigid. Each is laid onto earlier ones that may show the same, wherever
-the poses allow; what fits, at one place only, and agrees with another finding, enters a pose graph. At the end all
-submaps that see the same are laid onto each other.
+The trajectory is cut into submaps, which are taken as rigid. Each is registered to earlier ones that may show the same
+place, wherever the poses allow; a match at one place only that agrees with another finding enters a pose graph. At the
+end all overlapping submaps are registered to each other.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from stereovox.maps.record.kept_frames import KeptFrame
 from stereovox.products.floor.floor_axes import up_of
 
 LEAST_WAY_M = 3.0
-"""Metres of way between two visits that can be a loop."""
+"""Least path in metres between two visits that form a loop."""
 VIEW_M = 3.0
-"""Metres between the middles of what two submaps show, at most, if they share much."""
+"""Largest distance in metres between the middles of two submaps that overlap well."""
 TRIED = 6
-"""Earlier submaps that a new one is laid onto, the nearest."""
+"""Number of nearest earlier submaps that a new one is registered to."""
 NEIGHBOURS = 10
-"""Earlier submaps that each is laid onto at the end, the nearest."""
+"""Number of nearest earlier submaps that each is registered to at the end."""
 REACH = 4.75
-"""The same, not squared: how far a place is sought, to find others that look the same."""
+"""Deviations, not squared, within which a place is searched, to find others that look the same."""
 RIVALS = 7.1
-"""Deviations within which a place must not look the same elsewhere, half again as many: poses may be worse than said.
+"""Deviations, half again as many, within which no other place may look the same: poses may be worse than stated.
 """
 WIDEST = np.array([8.0, 8.0, 2.0]), 0.7
-"""Metres across and up, and radians, beyond which it is not."""
+"""Largest search, in metres across and up, and radians."""
 NARROW_M, NARROW_RAD = 0.35, 0.2
-"""Reach within which surfaces are found without a search."""
+"""Reach within which registration needs no search."""
 TURNS = 2
-"""How often positions are laid onto the way, and the way is bent by them."""
+"""Iterations of aligning positions with the trajectory and correcting it by them."""
 FLOATING = 100.0
-"""Metres and radians by which the first submap may move while positions hold the way; it is put back afterwards."""
+"""Freedom of the first submap, in metres and radians, while positions hold the trajectory; undone afterwards."""
 WITNESS_M = 15.0
-"""Metres of way within which two findings can bear each other out."""
+"""Metres of path within which two findings can confirm each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +61,11 @@ class Loop:
     """Two submaps that may show one place.
 
     Attributes:
-        first: Number of the earlier one.
-        second: Number of the later one.
-        match: How the later one lies on it.
+        first: Index of the earlier one.
+        second: Index of the later one.
+        match: Registration of the later one to the earlier one.
         off_m: Metres by which the poses were off.
-        off_rad: Radians by which they were.
+        off_rad: Radians by which the poses were off.
         why: Why it was refused, in words; "" if it was not.
     """
 
@@ -78,24 +78,24 @@ class Loop:
 
     @property
     def edge(self) -> Edge:
-        """Return what it says in a pose graph."""
+        """Return the loop as a pose-graph edge."""
         return Edge(self.first, self.second, self.match.T_earlier_later, information(self.match.covariance))
 
 
 class LoopCloser:
-    """Finds and closes the loops of a map's frames, which it takes in one by one.
+    """Finds and closes the loops of a map's frames, added one by one.
 
     Args:
         config: The map's settings.
         odometry: A second odometry, if there is one.
 
     Attributes:
-        submaps: The submaps so far, with their poses as now believed.
-        loops: The loops that are believed.
-        refused: Places that look the same and are not believed to be.
-        shapes: What submaps show; None if it is too little.
+        submaps: The submaps so far, with their current poses.
+        loops: The accepted loops.
+        refused: Places that look the same but were rejected.
+        shapes: Surfaces of submaps; None if there are too few.
         R_level_map: (3, 3) turns the map so that z points up.
-        repeats: Where what submaps show looks the same a short way on.
+        repeats: Where a submap's surroundings repeat a short distance away.
 
     Raises:
         MissingExtra: gtsam is not installed.
@@ -112,17 +112,17 @@ class LoopCloser:
         self.R_level_map = rotation_between(self._up, [0, 0, 1])
         self.repeats = Repeats(self.shapes, self.R_level_map)
         self._steps, self._overlaps, self._uprights = list[Edge](), list[Edge](), list[Upright]()
-        self._waiting: list[Loop] = []  # for another one that agrees
+        self._waiting: list[Loop] = []  # waiting for another one that agrees
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
         self._ways, self._way = list[tuple[float, float]](), PathLength()
 
     @property
     def places(self) -> NDArray[np.float64]:
-        """Return where the submaps' anchors are now believed to be: (S, 3) metres."""
+        """Return the current positions of the submaps' anchors: (S, 3) metres."""
         return np.array([submap.T_map_anchor[:3, 3] for submap in self.submaps])
 
     def add(self, frame: KeptFrame) -> bool:
-        """Take in the next frame, with the pose it came with; return whether loops were found."""
+        """Add the next frame, with its original pose; return whether loops were found."""
         pose, found = orthonormalise(frame.T_world_sensor), False
         own = [T for one, T in zip(self._frames, self._poses, strict=True) if one.sensor == frame.sensor]
         if is_long(own, pose):
@@ -135,11 +135,11 @@ class LoopCloser:
     def finish(
         self, progress: Callable[[int, int], object] = lambda done, total: None, positions: Positions | None = None
     ) -> None:
-        """Complete the last submap, and lay all that see the same onto each other.
+        """Complete the last submap, and register all overlapping ones to each other.
 
         Args:
-            progress: Called with how many submaps are done, and their number.
-            positions: Positions of the camera that do not drift, to hold its way.
+            progress: Called with the number of submaps done, and the total.
+            positions: Drift-free positions of the camera, to hold its trajectory.
 
         Raises:
             StereovoxError: `positions` are too few, or too close to each other.
@@ -155,12 +155,12 @@ class LoopCloser:
             self._hold(positions)
 
     def join(self, other: LoopCloser, T_map_other: Transform, loops: Sequence[Loop]) -> None:
-        """Put another recording next to this one, into one graph. Both are finished; call `finish` again.
+        """Add another recording to this one's graph. Both are finished; call `finish` again.
 
         Args:
             other: All of the other recording.
             T_map_other: (4, 4), maps its world into this one.
-            loops: What both saw: `first` is a number of this recording's submaps, `second` of the other's.
+            loops: Shared places: `first` is an index of this recording's submaps, `second` of the other's.
         """
         count = len(self.submaps)
         for submap in other.submaps:
@@ -175,12 +175,12 @@ class LoopCloser:
         self._solve()
 
     def corrected(self, part: slice = slice(None)) -> dict[tuple[str, int], Transform]:
-        """Return T_world_sensor (4, 4) of all frames as now believed, by sensor and stamp.
+        """Return T_world_sensor (4, 4) of all frames, corrected, by sensor and stamp.
 
-        Between two anchors frames move as these, interpolated in time; before the first and after the last as that.
+        Frames between two anchors move like these, interpolated in time; at the ends like the nearest anchor.
 
         Args:
-            part: The submaps of one recording, where another one was joined.
+            part: The submaps of one recording, if another one was joined.
         """
         submaps = sorted(self.submaps[part], key=lambda submap: submap.stamp_ns)
         stamps = [submap.stamp_ns for submap in submaps]
@@ -216,7 +216,7 @@ class LoopCloser:
         return len(self.loops) > before
 
     def _follow(self, last: Submap, submap: Submap) -> None:
-        """Place a submap behind the last one, as its poses say."""
+        """Place a submap after the last one, by its poses."""
         motion = inverse(last.T_odom_anchor) @ submap.T_odom_anchor
         metres, radians = submap.travelled - last.travelled, submap.turned - last.turned
         ends = last.frames[last.anchor], submap.frames[submap.anchor]
@@ -230,7 +230,7 @@ class LoopCloser:
         submap.T_map_anchor = last.T_map_anchor @ motion
 
     def _hold(self, positions: Positions) -> None:
-        """Hold the way at positions. How their world lies in the map is what fits best; the first submap stays."""
+        """Hold the trajectory at positions, whose world is aligned with the map; the first submap stays fixed."""
         found = positions.at(np.array([submap.stamp_ns for submap in self.submaps], np.int64))
         sigma = np.full(3, positions.sigma_m)
         for _ in range(TURNS):
@@ -255,7 +255,7 @@ class LoopCloser:
         return graph
 
     def _find(self, shape: Shape) -> None:
-        """Find earlier submaps that show what the latest one does."""
+        """Find earlier submaps that overlap the latest one."""
         last = len(self.submaps) - 1
         near = self._near(last)
         if not near:
@@ -271,7 +271,7 @@ class LoopCloser:
                 self._judge(loop)
 
     def _near(self, number: int) -> list[int]:
-        """Return the earlier submaps that may show the same as one, the nearest first."""
+        """Return the earlier submaps that may overlap one, the nearest first."""
         way = self.submaps[number].travelled
         within = VIEW_M + REACH * self._drift.shift_m(way)
         away = self._away(number)
@@ -279,14 +279,14 @@ class LoopCloser:
         return [int(i) for i in old[:TRIED]]
 
     def _away(self, number: int) -> NDArray[np.float64]:
-        """Return the metres between the middles of what a submap shows, and of what each earlier one does."""
+        """Return the distances in metres from a submap's middle to each earlier one's."""
         middles = np.array([submap.middle for submap in self.submaps[: number + 1]])
         return np.linalg.norm(middles[:-1] - middles[-1], axis=1)
 
     def _loop(self, first: int, second: int, later: Shape, covariance: NDArray[np.float64]) -> Loop | None:
-        """Return how a submap lies on an earlier one, within what the poses allow; None if it does not.
+        """Return the registration of a submap to an earlier one, within what the poses allow; None if it fails.
 
-        covariance: (6, 6) of where it stands as seen from the earlier one.
+        covariance: (6, 6) of its pose relative to the earlier one.
         """
         earlier, guess = self.shapes[self.submaps[first]], self._expected(first, second)
         if earlier is None:
@@ -310,9 +310,9 @@ class LoopCloser:
     def _rival_m(
         self, first: int, second: int, moved: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> float | None:
-        """Return how far away a submap may lie as well, where the surroundings repeat; None if it may not.
+        """Return the distance of another possible place of a submap, if the surroundings repeat; else None.
 
-        moved: (6,) by how much it lies off where it is expected; covariance: (6, 6) of that.
+        moved: (6,) its motion from the expected pose; covariance: (6, 6) of that.
         """
         one, other = self.submaps[first], self.submaps[second]
         shifts = self.repeats.shifts([one.middle, other.middle]) @ other.T_map_anchor[:3, :3]
@@ -327,7 +327,7 @@ class LoopCloser:
     def _starts(
         self, first: int, earlier: Shape, later: Shape, guess: Transform, covariance: NDArray[np.float64]
     ) -> Sequence[Transform]:
-        """Return the poses T_earlier_later (4, 4) from which surfaces are laid onto each other."""
+        """Return the poses T_earlier_later (4, 4) from which registration starts."""
         turn, shift = (
             REACH * float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (covariance[:3, :3], covariance[3:, 3:])
         )
@@ -348,7 +348,7 @@ class LoopCloser:
         self._solve()
 
     def _agree(self, a: Loop, b: Loop) -> bool:
-        """Return whether two loops say the same of how the way is bent, by the poses between them."""
+        """Return whether two loops imply the same drift, by the poses between them."""
         pairs = [(self.submaps[a.first], self.submaps[b.first]), (self.submaps[b.second], self.submaps[a.second])]
         metres = sum(abs(one.travelled - other.travelled) for one, other in pairs)
         if metres > WITNESS_M:
@@ -361,7 +361,7 @@ class LoopCloser:
         return squared(moved, covariance) < GATE
 
     def _found_overlaps(self, progress: Callable[[int, int], object]) -> list[Edge]:
-        """Lay all submaps that see the same onto each other; return what that says."""
+        """Register all overlapping submaps to each other; return the edges."""
         graph, known = self._solve(), {(loop.first, loop.second) for loop in self.loops}
         edges: list[Edge] = []
         for second in range(1, len(self.submaps)):
@@ -376,7 +376,7 @@ class LoopCloser:
         return edges
 
     def _overlap(self, first: int, second: int, later: Shape, covariance: NDArray[np.float64]) -> Edge | None:
-        """Return how a submap lies on an earlier one, near where it is expected."""
+        """Return the registration of a submap to an earlier one, near the expected pose."""
         earlier, guess = self.shapes[self.submaps[first]], self._expected(first, second)
         if earlier is None:
             return None
@@ -390,23 +390,23 @@ class LoopCloser:
 
 
 def check_one_way(history: History, frames: Sequence[KeptFrame]) -> None:
-    """Raise StereovoxError if a map's frames are not of a single way of cameras, so that no loops can be sought."""
+    """Raise StereovoxError if a map's frames are not one trajectory, so that no loops can be searched."""
     if history.recordings > 1:
         raise StereovoxError(
-            f"the map was merged of {history.recordings} recordings, which are no single way of a camera; close the "
-            "loops of each, and merge them with --find, more than two only where one was made after the other"
+            f"the map was merged of {history.recordings} recordings, which are not a single trajectory; close the "
+            "loops of each, and merge them with --find, more than two only if each was recorded after the other"
         )
     times = Counter((frame.sensor, frame.stamp_ns) for frame in frames)
     (sensor, stamp_ns), most = times.most_common(1)[0]
     if most > 1:
         raise StereovoxError(
-            f"{most} frames of {sensor} have the stamp {stamp_ns}; loops are closed of frames with a time of their own"
+            f"{most} frames of {sensor} have the stamp {stamp_ns}; loop closure needs frames with distinct stamps"
         )
     lidar = next((frame for frame in frames if isinstance(frame.camera, Lidar)), None)
     if lidar is not None:
         raise StereovoxError(
-            f"{lidar.name or lidar.sensor}: loops are sought among depth images, and this is a cloud; correct poses of "
-            "clouds by those of another program (stereovox remap)"
+            f"{lidar.name or lidar.sensor}: loops are searched in depth images, and this is a cloud; correct poses of "
+            "clouds with poses from another program (stereovox remap)"
         )
 
 

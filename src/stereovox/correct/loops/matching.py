@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether two submaps show one place: each is laid onto the other, and both must say the same."""
+"""Whether two submaps show one place: each is registered to the other, and both results must agree."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from stereovox.track.surfels import CONVERGED, Level, Patches, SurfelMap
 from stereovox.track.views import View, contradiction
 
 FLOOR = np.diag(np.repeat([np.radians(0.3), 0.01], 3) ** 2)
-"""Covariance that is added to that of a match: submaps are not quite rigid."""
+"""Covariance added to a match's own: submaps are not quite rigid."""
 DOUBT = np.diag(np.repeat([0.15, 0.4], 3) ** 2)
-"""Covariance of where a match begins: wide, so that it adds nothing to what surfaces say."""
+"""Prior covariance of a match: wide, so that only surfaces count."""
 LEVELS = 3
-"""Sizes of surfels that are used, from the coarsest: the finest are too few in a few frames."""
+"""Number of surfel sizes used, from the coarsest: a few frames have too few of the finest."""
 SHARED = 0.25
-"""Share of each submap's surface that the other must have seen."""
+"""Least share of each submap's surface that the other has seen."""
 USUAL = 0.8
-"""Share of that that must lie where the other saw it."""
+"""Least inlier share of that."""
 LOOKED_THROUGH, CLOSE = 0.05, 0.6
-"""Share of what both saw that may lie where the other looked through, by more than so many of its deviations."""
+"""Largest share of the common view in the other's free space, by more than this many deviations."""
 MUTUAL = 30.0
-"""Squared deviations, of six, by which the two ways of laying them may differ."""
+"""Largest squared deviations, of six, between the two registrations."""
 HELD_RAD, HELD_M = np.radians(2), 0.04
 """Standard deviations beyond which a match is open along some direction, as in a corridor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """How a submap lies on an earlier one.
+    """The registration of a submap to an earlier one.
 
     Attributes:
         T_earlier_later: (4, 4).
         covariance: (6, 6) of it: rotation and shift in the later one's axes.
         shared: Share of the surface of either that the other has seen.
-        held: Whether surfaces hold it in all directions.
+        held: Whether surfaces constrain it in all directions.
     """
 
     T_earlier_later: Transform
@@ -58,7 +58,7 @@ class _Laid(NamedTuple):
 
 
 def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
-    """Return how a submap lies on an earlier one near T_earlier_later (4, 4); None if they do not show one place."""
+    """Return the registration of two submaps near T_earlier_later (4, 4); None if they do not show one place."""
     there = _laid(earlier.surfels, later.patches, guess)
     back = None if there is None else _laid(later.surfels, earlier.patches, inverse(there.T))
     if there is None or back is None:
@@ -76,7 +76,7 @@ def matched(earlier: Shape, later: Shape, guess: Transform) -> Match | None:
 
 
 def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | None:
-    """Return the pose that lays patches onto surfels; None if too few have one, or lie where it is."""
+    """Return the pose that registers patches to surfels; None if too few have one, or fit it."""
     levels = surfels.levels(patches)[:LEVELS]
     middle = levels[1]
 
@@ -84,7 +84,7 @@ def _laid(surfels: SurfelMap, patches: Patches, guess: Transform) -> _Laid | Non
         for level in levels:
             yield Stage(level, CONVERGED * level.size)
             if level is middle and not _is_one_place(middle):
-                return  # the finer ones, which take longest, would be for nothing
+                return  # skip the finer ones, which take longest
 
     T, covariance = solve_stages(stages(), guess, DOUBT)
     return _Laid(T, covariance, middle.known) if _is_one_place(middle) else None
@@ -95,7 +95,7 @@ def _is_one_place(level: Level) -> bool:
 
 
 def _looked_through(earlier: list[View], later: list[View], T: Transform) -> float:
-    """Return the share of what both saw that lies where the other looked through."""
+    """Return the share of the common view that is in the other's free space."""
     found = [contradiction(view._replace(T=T @ view.T), earlier, CLOSE) for view in later]
     number = sum(count for _, count in found)
     return sum(share * count for share, count in found) / max(number, 1)
@@ -108,7 +108,7 @@ def _own_axes(covariance: NDArray[np.float64], T: Transform) -> NDArray[np.float
 
 
 def _seen_from(T: Transform, back: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance of T_earlier_later (4, 4) where `back` (6, 6) is that of its inverse.
+    """Return the covariance of T_earlier_later (4, 4) from `back` (6, 6), the covariance of its inverse.
 
     Both as `Fit.covariance`: rotation about the second's origin, then shift, along the first's axes.
     """

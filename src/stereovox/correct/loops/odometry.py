@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second odometry, such as that of wheels, next to the poses that frames come with."""
+"""A second odometry, such as wheel odometry, next to the frames' own poses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.poses.poses import Poses
 
 MAX_OFF_M = 100.0
-"""Metres by which a contradiction counts at most: a step is held by nothing there, and numbers can still be solved."""
+"""Cap in metres on a contradiction: there nothing constrains the step, and the system is still solvable."""
 
 
 class Odometry:
@@ -21,11 +21,11 @@ class Odometry:
 
     Args:
         poses: In any world, of the camera.
-        config: Says how far they drift.
+        config: Settings, with their drift.
 
     Attributes:
-        used: Steps that it had a part in.
-        contradicted: Steps of which it says something else than the frames' poses, so that neither is relied on.
+        used: Steps to which it contributed.
+        contradicted: Steps on which it contradicts the frames' poses, so that neither is trusted.
     """
 
     def __init__(self, poses: Poses, config: LoopsConfig):
@@ -35,17 +35,17 @@ class Odometry:
     def joined(
         self, stamps_ns: tuple[int, int], motion: Transform, covariance: NDArray[np.float64], way: tuple[float, float]
     ) -> tuple[Transform, NDArray[np.float64]]:
-        """Return the motion between two times that explains both odometries best, and its covariance.
+        """Return the motion between two times that best explains both odometries, and its covariance.
 
         Args:
             stamps_ns: The times.
             motion: (4, 4) by the frames' poses.
             covariance: (6, 6) of that.
-            way: Metres and radians of it in all.
+            way: Its total path in metres and radians.
 
         Returns:
-            (4, 4) and (6, 6): as given where this odometry has no pose near one of the times; where the two contradict
-            each other as given, but as uncertain as they differ.
+            (4, 4) and (6, 6): as given if this odometry has no pose near one of the times; if the two contradict each
+                other, as given, but with their difference as uncertainty.
         """
         try:
             first, second = (self._poses.at(stamp_ns) for stamp_ns in stamps_ns)
@@ -62,7 +62,7 @@ class Odometry:
         return moved_by(motion, gain @ moved), covariance - gain @ covariance
 
     def check(self) -> None:
-        """Raise StereovoxError if it was of no use at all, or is of another way or in another unit."""
+        """Raise StereovoxError if it never helped, or is of another trajectory or in another unit."""
         steps = self.used + self.contradicted
         if not steps:
             raise StereovoxError(f"{self.where}: has no poses at the times of the map's frames; give those of this way")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a second recording lies in the first one's world, by what both saw, with no guess to begin with.
+"""Global alignment of a second recording with the first, by their common view, without an initial guess.
 
-Some of its submaps are sought in all that the first one shows, at all headings. What fits there, and does not look the
-same a short way on, votes for how the two worlds lie; they are believed to lie so where several submaps agree, and no
-other way is nearly as good.
+Some of its submaps are searched in the whole first recording, at all headings. Each match that does not look the same a
+short distance away votes for the transform between the worlds; it is accepted if several submaps agree, and no other
+transform gets nearly as many votes.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from stereovox.geometry.se3 import Transform, inverse
 from stereovox.track.views import View
 
 SOUGHT = 12
-"""Submaps of the second recording that are sought, spread evenly over it."""
+"""Submaps of the second recording that are searched, evenly chosen."""
 UP_M = 1.5
 """Metres by which the heights of two worlds may differ."""
 BEYOND_M = 3.0
-"""Metres by which the second camera may be outside of where the first one was."""
+"""Metres by which the second camera may leave the area of the first one."""
 CELL_M, AREA_M = 0.4, 40.0
-"""Cells in which a place is sought in a whole map, and the largest side of the parts in which that is searched."""
+"""Cell size of the search in a whole map, and largest side of its parts, in metres."""
 PEAKS = 8
-"""Places that are looked at closely for each."""
+"""Candidates refined for each."""
 NEAREST = 3
-"""Submaps of the first recording that one is laid onto at each of them."""
+"""Submaps of the first recording to which it is registered at each candidate."""
 AGREE_M, AGREE_RAD = 0.5, np.radians(8)
-"""Within which two findings say the same of how the worlds lie, and what the second's drift adds: share of the way."""
+"""Tolerance within which two findings agree on the transform; drift of the second adds a share of its path."""
 DRIFT = 0.05
 LEAST = 3
-"""Submaps that must agree."""
+"""Fewest submaps that must agree."""
 RIVAL = 0.5
-"""Share of the submaps that agree that may say something else together."""
+"""Largest share of the agreeing submaps that may support another transform."""
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where a second recording lies.
+    """The alignment of a second recording.
 
     Attributes:
         T_first_second: (4, 4) maps its world into the first one's.
-        loops: What was found, once for each pair; `first` is a number of the first recording's submaps,
+        loops: The matches, one for each pair; `first` is an index of the first recording's submaps,
             `second` of the second's.
     """
 
@@ -66,15 +66,15 @@ class _Vote:
 def placed(
     first: LoopCloser, second: LoopCloser, progress: Callable[[int, int], object] = lambda done, total: None
 ) -> Placed:
-    """Find out where a second recording lies in the world of the first.
+    """Find the transform of a second recording into the world of the first.
 
     Args:
         first: All of the first recording.
         second: All of the second.
-        progress: Called with how many searches were done, and their number.
+        progress: Called with the number of searches done, and the total.
 
     Raises:
-        StereovoxError: Too little fits, or it fits elsewhere as well.
+        StereovoxError: Too little fits, or it also fits elsewhere.
     """
     numbers = sorted({round(i) for i in np.linspace(0, len(second.submaps) - 1, SOUGHT)})
     votes = list[_Vote]()
@@ -84,15 +84,15 @@ def placed(
     if not groups or _submaps(groups[0]) < LEAST:
         found = _submaps(groups[0]) if groups else 0
         raise StereovoxError(
-            f"where the second map lies in the first is not known: {found} of {len(numbers)} places of it were found "
-            f"there, {LEAST} must agree; say it (--transform)"
+            f"the transform between the maps is unknown: {found} of {len(numbers)} places of it were found "
+            f"in the first, {LEAST} must agree; give it (--transform)"
         )
     best = groups[0]
     rivals = [group for group in groups if not set(group) & set(best)]
     if rivals and _submaps(rivals[0]) > RIVAL * _submaps(best):
         raise StereovoxError(
             f"the second map fits the first in two ways ({_submaps(best)} and {_submaps(rivals[0])} of {len(numbers)} "
-            "places); say which one (--transform)"
+            "places); give the right one (--transform)"
         )
     best = sorted(best, key=lambda vote: vote.loop.match.shared)
     pairs = {(vote.loop.first, vote.loop.second): vote.loop for vote in best}  # several places may lead to one
@@ -100,7 +100,7 @@ def placed(
 
 
 def _votes(first: LoopCloser, second: LoopCloser, number: int, places: Sequence[Transform]) -> list[_Vote]:
-    """Return what a submap of the second recording says of how the worlds lie, by where it may be in the first's."""
+    """Return a submap's votes for the transform between the worlds, from its candidate poses in the first."""
     submap, votes = second.submaps[number], list[_Vote]()
     shape, middles = second.shapes[submap], np.array([one.middle for one in first.submaps])
     assert shape is not None
@@ -120,9 +120,9 @@ def _votes(first: LoopCloser, second: LoopCloser, number: int, places: Sequence[
 def _places(
     first: LoopCloser, second: LoopCloser, numbers: Sequence[int], progress: Callable[[int, int], object]
 ) -> dict[int, list[Transform]]:
-    """Return where each of these submaps of the second recording may lie in the first one's world (4, 4).
+    """Return candidate poses (4, 4) of these submaps of the second recording in the first one's world.
 
-    The first recording is searched part by part, so that time and memory grow with its way and not with the area that
+    The first recording is searched part by part, so that time and memory grow with its path, not with the area that
     it spans.
     """
     shapes = {number: shape for number in numbers if (shape := second.shapes[second.submaps[number]]) is not None}
@@ -145,9 +145,9 @@ def _places(
 
 
 def _areas(closer: LoopCloser) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the parts of the area near a recording's way in which another camera is sought.
+    """Return the parts of the area near a recording's path in which another camera is searched.
 
-    They are rectangles by their middles and half sizes (2,) in metres, levelled.
+    They are rectangles, given by middle and half size (2,) in metres, levelled.
     """
     level = np.array([one.T_map_anchor[:3, 3] for one in closer.submaps]) @ closer.R_level_map.T[:, :2]
     low, high = level.min(axis=0) - BEYOND_M, level.max(axis=0) + BEYOND_M
@@ -158,7 +158,7 @@ def _areas(closer: LoopCloser) -> list[tuple[NDArray[np.float64], NDArray[np.flo
 
 
 class _Shown:
-    """What a recording shows, levelled."""
+    """The surfaces and views of a recording, levelled."""
 
     def __init__(self, closer: LoopCloser):
         self._R_level_map = closer.R_level_map
@@ -174,7 +174,7 @@ class _Shown:
         self._points = np.concatenate(points)
 
     def search(self, middle: NDArray[np.float64], half: NDArray[np.float64]) -> Search | None:
-        """Return the search in a part of it, by its middle (2,) and half size (2,); None if it shows nothing."""
+        """Return the search in a part of it, given by middle (2,) and half size (2,); None if it has no surfaces."""
         near = (np.abs(self._points @ self._R_level_map.T[:, :2] - middle) <= half).all(axis=1)
         return Search(self._points[near], self._seeing(middle, half), self._R_level_map, CELL_M) if near.any() else None
 
@@ -188,7 +188,7 @@ class _Shown:
 
 
 def _agreeing(vote: _Vote, votes: Sequence[_Vote], second: LoopCloser) -> list[_Vote]:
-    """Return the votes that say the same as one, where the second recording's drift is allowed for."""
+    """Return the votes that agree with one, allowing for the second recording's drift."""
     found = []
     here = second.submaps[vote.loop.second]
     for other in votes:

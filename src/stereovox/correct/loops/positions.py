@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions that do not drift, as of a GNSS receiver, for the way of a camera."""
+"""Drift-free positions of a camera, as of a GNSS receiver."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
 
 MAX_GAP_NS = 2_000_000_000
-"""Between two positions this far apart in time none is interpolated."""
+"""Positions farther apart in time are not interpolated."""
 ROUNDS = 20
-"""Of reweighting, where some positions are wrong."""
+"""Rounds of reweighting, in case some positions are wrong."""
 LEAST, WIDE = 3, 5.0
-"""Positions that are needed, and by how many of their deviations they must be apart, to know how the worlds lie."""
+"""Fewest positions, and their least extent in deviations, to align the worlds."""
 AWAY = 4.0
-"""Deviations by which a place may be off: 99.9 % of right ones are within (chi-squared, of three axes)."""
+"""Largest deviations of a correct place: 99.9 % are within (chi-squared, three axes)."""
 
 
 @dataclass(eq=False)
 class Positions:
-    """Where a camera was at some times, in a world of its own: metres, with the same way up as the map.
+    """A camera's positions at some times in their own world, in metres, with the map's up direction.
 
     Attributes:
         stamps_ns: (N,) int64, ascending.
         places: (N, 3) float64 metres.
         sigma_m: Standard deviation along each axis, in metres.
         where: Name, for messages.
-        used: Places of the way that in the end are where these say.
-        contradicted: Places that are not.
+        used: Places of the trajectory that agree with these in the end.
+        contradicted: Places that do not.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -55,19 +55,19 @@ class Positions:
         return found
 
     def check(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Raise StereovoxError if places at so few of these times are known, or so close, that they cannot be laid
-        into a map.
+        """Raise StereovoxError if too few places at these times are known, or they are too close together, to align
+        them with a map.
         """
         self._check(self.at(stamps_ns))
 
     def in_map(
         self, found: NDArray[np.float64], anchors: NDArray[np.float64], R_level_map: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return places (M, 3) turned about the vertical and shifted to where they fit best.
+        """Return places (M, 3) turned about the vertical and shifted for the best fit.
 
         Args:
             found: (M, 3) places, NaN if there is none.
-            anchors: (M, 3) where the map has them.
+            anchors: (M, 3) the map's positions of them.
             R_level_map: (3, 3) turns the map so that z points up.
 
         Raises:
@@ -83,13 +83,13 @@ class Positions:
         return (found @ R_level_map.T @ R.T + shift) @ R_level_map
 
     def compare(self, found: NDArray[np.float64], places: NDArray[np.float64]) -> None:
-        """Count which places (M, 3) of the way are where these say: (M, 3) in the map, NaN where they say nothing."""
+        """Count the places (M, 3) of the trajectory that agree with these: (M, 3) in the map, NaN if missing."""
         off_m = np.linalg.norm(found - places, axis=1)
         self.used = int(np.count_nonzero(off_m <= AWAY * self.sigma_m))
         self.contradicted = int(np.count_nonzero(off_m > AWAY * self.sigma_m))
 
     def check_used(self) -> None:
-        """Raise StereovoxError if they are of another way or in another unit."""
+        """Raise StereovoxError if they are of another trajectory or in another unit."""
         if self.contradicted > self.used:
             raise StereovoxError(
                 f"{self.where}: contradicts the way in {self.contradicted} of {self.contradicted + self.used} places; "
@@ -115,7 +115,7 @@ class Positions:
 def _laid(
     a: NDArray[np.float64], b: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the turn (3, 3) about z and the shift (3,) that lay points (N, 3) onto others, by least squares."""
+    """Return the turn (3, 3) about z and the shift (3,) that align points (N, 3) with others, by least squares."""
     middle_a, middle_b = (np.average(points, axis=0, weights=weights) for points in (a, b))
     (ax, ay), (bx, by) = (a - middle_a)[:, :2].T, (b - middle_b)[:, :2].T
     turn = np.arctan2((weights * (ax * by - ay * bx)).sum(), (weights * (ax * bx + ay * by)).sum())

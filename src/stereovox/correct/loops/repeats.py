@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a recording looks like itself a short way on, such as from one shelf of a warehouse to the next.
+"""Self-similarity of a recording a short distance away, such as between shelves of a warehouse.
 
-Each submap is laid onto what was seen just before it, of which the poses say for sure where it is. What fits there at
-another place is a repeat: surfaces alone cannot tell the two apart, wherever the camera comes back.
+Each submap is registered to its immediate predecessors, whose relative pose is certain. A match at another place is a
+repeat: surfaces alone cannot tell the two apart, wherever the camera returns.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from stereovox.correct.loops.submaps import Shape, Shapes, Submap
 from stereovox.geometry.se3 import Transform, inverse, transform_points
 
 RECENT_M = 0.5, 12.0
-"""Metres of way, at least and at most, to the submaps that one is compared with."""
+"""Least and largest path in metres to the submaps that one is compared with."""
 REACH = np.array([6.0, 6.0, 0.4]), 0.12
-"""Metres across and up, and radians, within which a repeat is sought."""
+"""Metres across and up, and radians, within which a repeat is searched."""
 PEAKS = 6
-"""Places that are looked at closely."""
+"""Candidates refined."""
 NEAR_M = 6.0
-"""Metres from a place within which repeats count for it: what repeats goes on repeating."""
+"""Metres from a place within which repeats count for it: repeating structures continue."""
 SEEN_BY, SHARE = 3, 0.2
 """Submaps near a place, and share of them, that must have found the same repeat: single ones are chance."""
 ALIKE_M = 0.2
@@ -33,7 +33,7 @@ ALIKE_M = 0.2
 
 
 class _Repeat(NamedTuple):
-    """A submap that looks the same where it is shifted by so much (3,), in its own axes."""
+    """A submap that looks the same when shifted by `shift` (3,), in its own axes."""
 
     submap: Submap
     shift: NDArray[np.float64]
@@ -43,7 +43,7 @@ class Repeats:
     """The repeats of a recording.
 
     Args:
-        shapes: What submaps show.
+        shapes: Surfaces of submaps.
         R_level_map: (3, 3) turns the map so that z points up.
     """
 
@@ -66,7 +66,7 @@ class Repeats:
                 self._found.append(_Repeat(last, shift))
 
     def shifts(self, places: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the shifts (N, 3) in metres, in the map's axes, by which what is near places (3,) looks the same."""
+        """Return the shifts (N, 3) in metres, in the map's axes, by which the surroundings of places (3,) repeat."""
         looked = sum(_is_near(submap, places) for submap in self._looked)
         near = [one for one in self._found if _is_near(one.submap, places)]
         shifts = np.reshape([one.submap.T_map_anchor[:3, :3] @ one.shift for one in near], (-1, 3))
@@ -75,7 +75,7 @@ class Repeats:
 
 
 def _points(shown: Sequence[tuple[Submap, Shape]], last: Submap) -> NDArray[np.float64]:
-    """Return points (N, 3) on all that submaps show, in the axes of the last one."""
+    """Return points (N, 3) on the surfaces of submaps, in the axes of the last one."""
     motions = [inverse(last.T_odom_anchor) @ one.T_odom_anchor for one, _ in shown]
     return np.concatenate([transform_points(T, shape.points) for T, (_, shape) in zip(motions, shown, strict=True)])
 
@@ -85,7 +85,7 @@ def _is_near(submap: Submap, places: Sequence[NDArray[np.float64]]) -> bool:
 
 
 def _agreeing(repeats: Sequence[_Repeat], shifts: NDArray[np.float64], shift: NDArray[np.float64]) -> set[Submap]:
-    """Return the submaps that found a shift, this way or the other."""
+    """Return the submaps that found a shift, in either direction."""
     away = np.minimum(np.linalg.norm(shifts - shift, axis=1), np.linalg.norm(shifts + shift, axis=1))
     return {one.submap for one, metres in zip(repeats, away, strict=True) if metres < ALIKE_M}
 
@@ -93,7 +93,7 @@ def _agreeing(repeats: Sequence[_Repeat], shifts: NDArray[np.float64], shift: ND
 def _refined(
     shown: Sequence[tuple[Submap, Shape]], last: Submap, later: Shape, T: Transform
 ) -> NDArray[np.float64] | None:
-    """Return by how much (3,) a submap is shifted where it fits, near T_last_place (4, 4); None if it does not."""
+    """Return the shift (3,) at which a submap fits, near T_last_place (4, 4); None if it does not."""
     T_odom_place = last.T_odom_anchor @ T
     here = transform_points(T_odom_place, last.centre)
     away = [np.linalg.norm(transform_points(one.T_odom_anchor, one.centre) - here) for one, _ in shown]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a submap may lie on an earlier one: a search over shifts and headings on a coarse grid (Olson 2009)."""
+"""Correlative search for a submap's pose on an earlier one, over shifts and headings on a coarse grid (Olson 2009)."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 from stereovox.track.views import GRID, View
 
 SEEDS = 300
-"""Points of the later submap that are used."""
+"""Number of points used of the later submap."""
 ON, BESIDE, THROUGH = 2, 1, -2
-"""Scores of a point in a cell with a surface, in one next to such, and in one that was looked through."""
+"""Scores of a point in a cell with a surface, next to one, and in a cell seen through."""
 BEHIND_M = 0.4
-"""A cell was looked through if it is nearer than what was seen by this."""
+"""A cell is seen through if it is nearer than the surface behind it by this."""
 TURN_STEP = np.radians(3.5)
 PEAKS = 4
-"""Places that are looked at closely, usually."""
+"""Usual number of candidates refined."""
 SAME_M, SAME_RAD = 0.5, np.radians(12)
-"""Within which two places are one."""
+"""Metres and radians within which two places are the same."""
 AT_ONCE = 1 << 20
-"""Cells that are looked at together, so that large grids need little memory."""
+"""Cells processed at once, so that large grids need little memory."""
 LEAST = 0.12
-"""Score, of at most 1, that a place needs."""
+"""Least score, of at most 1, of a place."""
 
 
 class Search:
-    """Finds where submaps may lie on an earlier one.
+    """Finds candidate poses of submaps on an earlier one.
 
     Args:
         points: (N, 3) points on its surfaces.
-        views: What its frames saw.
+        views: The views of its frames.
         R_level_earlier: (3, 3) turns its frame so that z points up.
         cell: Side of a cell of the grid, in metres.
     """
@@ -60,7 +60,7 @@ class Search:
     def places(
         self, later: Shape, guess: Transform, reach: NDArray[np.float64], turn: float, most: int = PEAKS
     ) -> list[Transform]:
-        """Return the likeliest poses T_earlier_later (4, 4), best first; arguments as of `peaks`."""
+        """Return the likeliest poses T_earlier_later (4, 4), best first; arguments as for `peaks`."""
         return [
             inverse(self._T) @ peak.T_level_later for peak in apart(self.peaks(later, guess, reach, turn, most), most)
         ]
@@ -70,10 +70,10 @@ class Search:
 
         Args:
             later: A submap.
-            guess: (4, 4) T_earlier_later where the search begins.
-            reach: (3,) metres to each side of it that are searched: across and up.
+            guess: (4, 4) T_earlier_later where the search starts.
+            reach: (3,) half size of the search in metres: across and up.
             turn: Radians by which its heading may be off.
-            most: Largest number of places of a heading.
+            most: Most places per heading.
         """
         seeds = later.points[:: max(1, len(later.points) // SEEDS)]
         steps = int(np.ceil(turn / self._turn))
@@ -92,7 +92,7 @@ class Search:
         return peaks
 
     def _highest(self, found: NDArray[np.int32], least: float, most: int) -> list[tuple[tuple[int, ...], int]]:
-        """Return where the highest scores are, and these, none in the neighbourhood of another; `found` is used up."""
+        """Return the places and values of the highest scores, none near another; `found` is overwritten."""
         highest, near = list[tuple[tuple[int, ...], int]](), int(np.ceil(SAME_M / self._cell))
         while len(highest) < most:
             place = tuple(int(i) for i in np.unravel_index(found.argmax(), found.shape))
@@ -103,14 +103,14 @@ class Search:
         return highest
 
     def _mark_free(self, views: Iterable[View]) -> None:
-        """Mark cells that views looked through."""
+        """Mark cells that views saw through."""
         seen, (count, *others) = list(views), self._grid.shape
         step = max(1, AT_ONCE // max(1, others[0] * others[1]))
         for first in range(0, count, step):
             self._mark_free_in(self._grid[first : first + step], first, seen)
 
     def _mark_free_in(self, slab: NDArray[np.int8], first: int, views: Iterable[View]) -> None:
-        """Mark those of a part of the grid, from this number along its first axis."""
+        """Mark the cells of a slab of the grid, which starts at `first` along the first axis."""
         starts = np.array([first, 0, 0]) + self._low + 0.5
         x, y, z = (self._cell * (np.arange(n) + start) for n, start in zip(slab.shape, starts, strict=True))
         for view in views:
@@ -140,10 +140,10 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Peak:
-    """A place where a submap may lie on what a search knows, in its axes turned so that z points up.
+    """A candidate place of a submap in a search, in its axes turned so that z points up.
 
     Attributes:
-        score: How well it fits there.
+        score: Its score there.
         angle: Radians by which its heading is turned from the guess.
         place: (3,) metres.
         R: (3, 3) its rotation.
@@ -163,7 +163,7 @@ class Peak:
 
 
 def apart(peaks: Sequence[Peak], most: int) -> list[Peak]:
-    """Return at most so many peaks from high to low, without those near a higher one."""
+    """Return at most `most` peaks from high to low, without peaks near a higher one."""
     kept = list[Peak]()
     for peak in sorted(peaks, key=lambda peak: -peak.score):
         if not any(_is_same(peak, other) for other in kept):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Submaps: short runs of a map's frames, taken as rigid, and what they show."""
+"""Submaps: short runs of a map's frames, taken as rigid, and their surfaces."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from stereovox.track.surfels import Patches, SurfelMap
 from stereovox.track.views import View, view_of
 
 LONG_M, LONG_RAD = 0.8, np.radians(40)
-"""How far a submap's last frame may be from its first."""
+"""Largest motion from a submap's first frame to its last."""
 USED = 5
-"""Frames of a submap that are looked at, spread evenly over it."""
+"""Frames used of a submap, evenly chosen."""
 MAX_PATCHES = 4000
-"""Patches of a submap that are laid onto others."""
+"""Most patches of a submap used in registration."""
 COARSE_M = 0.2
-"""Cells of which each gives one point for the search."""
+"""Size of cells that give one point each for the search."""
 HALF = 1 << 20
-"""Cells to each side of a submap that have a number of their own."""
+"""Cells to each side of a submap with distinct numbers."""
 IN_MEMORY = 48
-"""Submaps whose surfaces are held; others are made again from their frames."""
+"""Submaps whose surfaces stay in memory; others are rebuilt from their frames."""
 
 
 @dataclass(eq=False)
 class Submap:
-    """A run of frames, in the order they entered the map, whose poses to each other are taken as right.
+    """A run of frames, in the order they entered the map, whose relative poses are taken as exact.
 
     Attributes:
-        frames: The frames, with the poses they came with.
+        frames: The frames, with their original poses.
         T_odom_frames: Their poses (4, 4), exactly rigid.
-        anchor: Number of the frame whose axes are the submap's: the middle one.
-        T_map_anchor: (4, 4) pose of that, as now believed.
-        travelled: Metres of the way until there.
-        turned: Radians of turning until there.
-        centre: (3,) mean of what it shows, in its axes.
+        anchor: Index of the frame whose axes are the submap's: the middle one.
+        T_map_anchor: (4, 4) current pose of that frame.
+        travelled: Metres of the path up to there.
+        turned: Radians of turning up to there.
+        centre: (3,) mean of its surfaces, in its axes.
     """
 
     frames: Sequence[KeptFrame]
@@ -55,12 +55,12 @@ class Submap:
 
     @property
     def anchor(self) -> int:
-        """Number of the frame whose axes are the submap's."""
+        """Index of the frame whose axes are the submap's."""
         return len(self.frames) // 2
 
     @property
     def T_odom_anchor(self) -> Transform:  # noqa: N802
-        """Return the pose (4, 4) that the anchor came with."""
+        """Return the original pose (4, 4) of the anchor."""
         return self.T_odom_frames[self.anchor]
 
     @property
@@ -70,22 +70,22 @@ class Submap:
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """Return the mean (3,) of what it shows, in the map."""
+        """Return the mean (3,) of its surfaces, in the map."""
         return self.T_map_anchor[:3, :3] @ self.centre + self.T_map_anchor[:3, 3]
 
     @property
     def bend(self) -> Transform:
-        """Return what moves poses as they came, near the anchor, to where they are now believed (4, 4)."""
+        """Return the motion (4, 4) from original to current poses near the anchor."""
         return self.T_map_anchor @ inverse(self.T_odom_anchor)
 
 
 class Shape:
-    """What a submap shows, in its anchor's frame.
+    """The surfaces of a submap, in its anchor's frame.
 
     Attributes:
         surfels: Its surfaces.
-        patches: Some of them, to be laid onto those of other submaps.
-        views: What its frames saw.
+        patches: A sample of them, for registration to other submaps.
+        views: The views of its frames.
         points: (N, 3) one point for each coarse cell with a surface.
     """
 
@@ -103,14 +103,14 @@ class Shape:
 
 
 class Shapes:
-    """The shapes of submaps, made when they are needed; the latest used are held."""
+    """The shapes of submaps, built on demand; the latest used are cached."""
 
     def __init__(self, config: Config):
         self._surfaces = Surfaces(config)
         self._held: OrderedDict[Submap, Shape | None] = OrderedDict()
 
     def __getitem__(self, submap: Submap) -> Shape | None:
-        """Return what a submap shows; None if it is too little."""
+        """Return the shape of a submap; None if it has too few surfaces."""
         if submap not in self._held:
             self._held[submap] = self._made(submap)
             while len(self._held) > IN_MEMORY:
@@ -140,7 +140,7 @@ def is_long(T_odom_frames: Sequence[Transform], T_odom_next: Transform) -> bool:
 
 
 def _joined(seen: Sequence[tuple[Patches, Transform]]) -> Patches:
-    """Return all patches in the frame that their poses lead to."""
+    """Return all patches, moved by their poses into one frame."""
     points = [patches.points @ T[:3, :3].T + T[:3, 3] for patches, T in seen]
     normals = [patches.normals @ T[:3, :3].T for patches, T in seen]
     sigma = [patches.sigma for patches, _ in seen]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Align one 2-D map with another: a map made by SLAM has a frame of its own.
+"""Align one 2-D map with another: a map made by SLAM has its own frame.
 
 Coarse: for every rotation, the cross-correlation (FFT) of two small images of the maps gives the best shift. Fine: the
 best of these, and the start, are refined until walls lie on walls (`Fit`). Deterministic: nothing is sampled at random.
@@ -18,7 +18,7 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 FEW, MANY = 600, 4000
-"""Number of wall and floor cells sampled from each map: to rank motions, and to refine the best."""
+"""Wall and floor cells sampled from each map: to rank motions, and to refine the best."""
 MAX_ACROSS = 3000
 """Pixels along the longer side of a distance image; larger maps get larger pixels."""
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
@@ -35,10 +35,10 @@ ALIKE = 0.98
 
 
 class Fit:
-    """Two maps as points: centres of their occupied and free cells, in metres from the lower left corner of each.
+    """Two maps as points: centres of their occupied and free cells, in metres from each map's lower left corner.
 
-    walls, their_walls: at least one each. resolution: side of a cell in metres. reach: metres up to which distances
-    count.
+    walls, their_walls: at least one each. resolution: side of a cell in metres. reach: largest distance in metres that
+    counts.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Fit:
         return float(np.mean([np.exp(-0.5 * (field.metres(at) / width) ** 2).mean() for field, at in pairs]))
 
     def agreement(self, pose: ArrayLike) -> float:
-        """Return the likelihood for walls two cells wide, and the share of our floor that lies on theirs; 0 to 2."""
+        """Return the likelihood for walls two cells wide, plus the share of our floor on theirs; 0 to 2."""
         walls = self.likelihood(pose, 2 * self.resolution)
         if not len(self._floor) or self._their_floor is None:
             return walls
@@ -70,7 +70,7 @@ class Fit:
         return walls + float((metres < self.resolution).mean())
 
     def refined(self, pose: ArrayLike, width: float, stop: float, max_points: int = MANY) -> se2.Pose:
-        """Return the pose near `pose` of the highest likelihood: steps along x, y and yaw, halved where none helps.
+        """Return the pose near `pose` of the highest likelihood: steps along x, y and yaw, halved if none helps.
 
         The likelihood's width is `width` at first and half as much at the end; `stop` is the smallest step in metres.
         """
@@ -87,7 +87,7 @@ class Fit:
         return best
 
     def distance(self, start: ArrayLike, end: ArrayLike) -> float:
-        """Return the distance of two poses in metres: of the map's centre, plus that of its rim by the rotation."""
+        """Return the distance of two poses in metres: of the map's centre, plus the rotation's shift of its rim."""
         x, y, yaw = se2.relative(self._at_middle(start), self._at_middle(end))
         return float(np.hypot(x, y) + self._radius * abs(yaw))
 
@@ -115,7 +115,7 @@ class _Field:
         self._metres = np.asarray(distance_transform_edt(empty, sampling=self._side), np.float32)
 
     def metres(self, points: Points) -> NDArray[np.float32]:
-        """Interpolate the distance of (N, 2) points; beyond the image that of its rim."""
+        """Interpolate the distance of (N, 2) points; beyond the image, the value at its rim."""
         from scipy.ndimage import map_coordinates
 
         places = (points - self._low).T[::-1] / self._side
@@ -133,7 +133,7 @@ def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike 
     """Return (3,) pose_reference_map, the motion of the frame of `grid` that aligns it with `reference`.
 
     All rotations and shifts are searched; among those that fit about as well as the best, the one nearest to `start`,
-    (3,), is returned. Where one of the maps has no occupied cell, `start` is returned.
+    (3,), is returned. If one of the maps has no occupied cell, `start` is returned.
     """
     start = np.asarray(start, float)
     ours, theirs = _cell_centres(grid), _cell_centres(reference)
@@ -196,7 +196,7 @@ class _Correlator:
 
     def __init__(self, image: NDArray[np.float32], corner: NDArray[np.float64], side: float, reach: int):
         self._corner, self._side, self._reach = corner, side, reach
-        rows, columns = (-(-(n + 2 * reach) // 32) * 32 for n in image.shape)  # lengths that an FFT is quick at
+        rows, columns = (-(-(n + 2 * reach) // 32) * 32 for n in image.shape)  # lengths for which an FFT is fast
         self._shape = (rows, columns)
         self._spectrum = np.fft.rfft2(image, self._shape)
 
@@ -206,12 +206,12 @@ class _Correlator:
         image = _binned(points / self._side + self._reach + 0.5, weights, (size, size))
         fits = np.fft.irfft2(self._spectrum * np.conj(np.fft.rfft2(image, self._shape)), self._shape)
         at = np.array(np.unravel_index(int(np.argmax(fits)), self._shape))
-        at -= np.where(at >= np.array(self._shape) - 2 * self._reach, self._shape, 0)  # shifts below zero wrap round
+        at -= np.where(at >= np.array(self._shape) - 2 * self._reach, self._shape, 0)  # shifts below zero wrap around
         return float(fits.max()), self._corner + (at[::-1] + self._reach) * self._side
 
 
 def _from_origin(pose_reference_middle: se2.Pose, middle: NDArray[np.float64]) -> se2.Pose:
-    """Return pose_reference_map from a pose of the map's centre, about which the map was rotated."""
+    """Return pose_reference_map from a pose of the map's centre, the centre of rotation."""
     return se2.compose(pose_reference_middle, [-middle[0], -middle[1], 0.0])
 
 
@@ -229,7 +229,7 @@ def _apart(poses: list[se2.Pose], side: float, reach: int) -> list[se2.Pose]:
 def _thinned(centres: _CellCentres, side: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return points (N, 2), at most one per cell of `side`, and their weights: walls above zero, floor below.
 
-    A cell that holds both is a wall; all walls together weigh as much as all floor.
+    A cell with both is a wall; all walls together weigh as much as all floor.
     """
     walls, floor = (np.floor(points / side).astype(np.int64) for points in (centres.walls, centres.floor))
     cells = np.zeros(np.concatenate([walls, floor]).max(axis=0) + 1, np.int8)

@@ -15,7 +15,7 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 MAX_CELLS = 40_000_000
-"""Cells of the rectangle that holds both maps: 126 m x 126 m in cells of 2 cm. Distances take 40 bytes a cell."""
+"""Most cells of the rectangle around both maps: 126 m x 126 m in cells of 2 cm. Distances take 40 bytes a cell."""
 EMPTY_REFERENCE = "the reference has no free and no occupied cell: there is nothing to compare with; give another"
 ROWS_AT_ONCE = 256
 TIE = 1e-6
@@ -26,10 +26,10 @@ Rectangle = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class AlignedGrids:
-    """A map laid on a reference: both on the cells of the reference, in the reference's map frame.
+    """A map aligned with a reference: both on the cells of the reference, in the reference's map frame.
 
     map, reference: cover all cells known to either, at least one.
-    excluded: (rows, columns) bool, cells whose centre lies in an excluded region.
+    excluded: (rows, columns) bool, cells whose centre is in an excluded region.
     motion: (3,) pose_reference_map by which the map was moved.
     """
 
@@ -42,11 +42,11 @@ class AlignedGrids:
 def aligned_grids(
     grid: OccupancyGrid, reference: OccupancyGrid, motion: ArrayLike = (0, 0, 0), exclude: Iterable[Rectangle] = ()
 ) -> AlignedGrids:
-    """Lay `grid` on the cells of `reference`, moved by `motion`: (3,) pose_reference_map of the two map frames.
+    """Resample `grid` on the cells of `reference`, moved by `motion`: (3,) pose_reference_map of the two map frames.
 
-    A cell takes the value at its centre; an occupied cell of the map that holds no such centre (a coarser reference, a
-    rotation) is entered where its own centre lies, so that no obstacle is lost. Raises StereovoxError for an invalid
-    region, a reference without known cells, and maps too far apart for one image.
+    A cell takes the value at its centre; an occupied cell of the map that contains no such centre (a coarser reference,
+    a rotation) is entered at its own centre, so that no obstacle is lost. Raises StereovoxError for an invalid region,
+    a reference without known cells, and maps too far apart for one image.
     """
     motion = np.asarray(motion, float)
     pose = se2.compose(se2.inverse(reference.origin), se2.compose(motion, grid.origin))
@@ -76,7 +76,7 @@ def three_states(grid: OccupancyGrid) -> NDArray[np.uint8]:
 def resampled(grid: OccupancyGrid, pose_target_source: ArrayLike, target: OccupancyGrid) -> NDArray[np.int8]:
     """Resample `grid` onto the cells of `target`: (rows, columns) int8.
 
-    pose_target_source: (3,), the lower left corner of `grid` in the frame of that of `target`.
+    pose_target_source: (3,), the lower left corner of `grid` in the frame of `target`'s.
     """
     shape = target.cells.shape
     cells, found = np.full(shape, UNKNOWN, np.int8), np.zeros(grid.cells.shape, bool)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare a 2-D map with a reference: the error of IST 2019, Eq 7, and measures with a tolerance.
 
-As in IST 2019, IV-B, a cell is wrong if "the occupation value" differs, so there are three values, and a cell that
-only one of the maps knows is wrong too: the paper says so of a corridor that its camera never saw, which is white in
-Fig 6. An excluded region is "compensated in the error formula, as being, in fact, black": its cells count as right, and
-still belong to the free and occupied cells of the reference in the denominator.
+As in IST 2019, IV-B, a cell is wrong if "the occupation value" differs, so there are three values, and a cell known to
+only one map is wrong too: the paper says so of a corridor that its camera never saw, which is white in Fig 6. An
+excluded region is "compensated in the error formula, as being, in fact, black": its cells count as right, and still
+belong to the free and occupied cells of the reference in the denominator.
 
-So Eq 7 adds up two things: coverage, what one of the maps never saw, and contradiction, where they say the opposite. A
-camera that sees less than a lidar has much of the first, a map that is wrong has much of the second; both are reported.
+So Eq 7 sums two parts: coverage, cells that one map never saw, and contradiction, cells with opposite states. A camera
+that sees less than a lidar has much of the first, a wrong map much of the second; both are reported.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Difference(IntEnum):
     """How a cell differs.
 
     SAME: both maps agree, or neither knows it; MISSED: only the reference knows it; WRONGLY_OCCUPIED, WRONGLY_FREE: the
-    map says so and the reference the opposite; EXTRA: only the map knows it; FORGIVEN: differs in an excluded region.
+    map and reference have opposite states; EXTRA: only the map knows it; FORGIVEN: differs in an excluded region.
     """
 
     SAME = 0
@@ -67,11 +67,11 @@ def wrong(found: NDArray[np.uint8]) -> NDArray[np.bool_]:
 class CellErrors:
     """Counts of cells by how they differ.
 
-    eq7_percent: IST 2019, Eq 7: all that differ / (free and occupied cells of the reference) * 100; can exceed 100.
-    eq7_coverage_percent, eq7_contradiction_percent: its two parts, which add up to it: cells that only one of the maps
-        knows (missed, extra), and cells that both know and call by different states (wrongly occupied, wrongly free).
+    eq7_percent: IST 2019, Eq 7: cells that differ / (free and occupied cells of the reference) * 100; can exceed 100.
+    eq7_coverage_percent, eq7_contradiction_percent: its two parts, which sum to it: cells that only one of the maps
+        knows (missed, extra), and cells with different known states (wrongly occupied, wrongly free).
     eq7_outside_percent: the same as Eq 7 without excluded cells in the denominator; never less.
-    known_error_percent: of the cells known to both maps, those that differ; None if missing.
+    known_error_percent: share that differ of the cells known to both maps; None if there are none.
     missed, wrongly_occupied, wrongly_free, extra: the cells that differ, see `Difference`; forgiven: those that differ
         in excluded regions and do not count.
     reference_occupied, reference_free: all such cells of the reference, including excluded ones.
@@ -149,7 +149,7 @@ class Distances:
 
 
 def distances(start: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: float) -> NDArray[np.float64]:
-    """Return (N,) metres from the centre of each cell of `start` to the nearest of `goal`; empty where either is."""
+    """Return (N,) metres from the centre of each cell of `start` to the nearest of `goal`; empty if either is."""
     from scipy.ndimage import distance_transform_edt
 
     if not goal.any():
@@ -162,9 +162,9 @@ def distances(start: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: flo
 class Overlap:
     """Overlap of two sets of cells; None for a division by zero.
 
-    iou: intersection over union. tolerance_precision: share of the map's cells with one of the reference within the
-    tolerance; tolerance_recall: of the reference's with one of the map. iou_tolerant: the IoU whose intersection is the
-    mean of the two numbers of cells that have one within the tolerance.
+    iou: intersection over union. tolerance_precision: share of the map's cells with a reference cell within the
+    tolerance; tolerance_recall: share of the reference's with a map cell. iou_tolerant: the IoU whose intersection is
+    the mean number of cells with a partner within the tolerance.
     """
 
     iou: float | None
@@ -202,7 +202,7 @@ def within(cells: NDArray[np.bool_], tolerance: int) -> NDArray[np.bool_]:
 class GridTally:
     """Measures over one set of cells that the reference knows; positive: the map calls it occupied (Valenti 2018, 8.3).
 
-    correlation: Pearson's, of the map's probability (0.5 where unknown) and the truth.
+    correlation: Pearson's, of the map's probability (0.5 if unknown) and the truth.
     """
 
     cells: int
@@ -222,10 +222,10 @@ class GridTally:
 class GridScores:
     """All measures of one map against a reference, over cells of the reference's size outside excluded regions.
 
-    errors: Eq 7 and its parts. tally: over all cells the reference knows, where a cell unknown to the map is not
-    called occupied; observed: over those known to both. error: mean squared error of the map's
-    probabilities over those (Brier score). coverage: share of the reference's cells that the map knows.
-    occupied: how well the occupied cells match, exactly and within `tolerance_cells` along each axis, also if the
+    errors: Eq 7 and its parts. tally: over all cells the reference knows, with cells unknown to the map as not
+    occupied; observed: over cells known to both. error: mean squared error of the map's probabilities over these (Brier
+    score). coverage: share of the reference's cells that the map knows.
+    occupied: match of the occupied cells, exactly and within `tolerance_cells` along each axis, also if the
     reference knows nothing; free_iou: intersection over union of the free cells.
     to_reference, from_reference: metres from each occupied cell of the map to the nearest of the reference, and back.
     motion: (3,) pose_reference_map by which the map was moved; aligned: whether it was searched for.
@@ -286,7 +286,7 @@ def score_grids(
 ) -> GridScores:
     """Compare a 2-D map with a reference.
 
-    exclude: regions (x0, y0, x1, y1) in metres of the reference's map frame that do not count. align: whether to search
+    exclude: regions (x0, y0, x1, y1) in metres of the reference's map frame to ignore. align: whether to search
     for the motion that aligns the map with the reference; else the map is moved by `start`, (3,) pose_reference_map.
     tolerance: cells along each axis. Raises StereovoxError for a reference without known cells, maps too far
     apart, and numbers out of range.
@@ -308,7 +308,7 @@ def laid_on(
 def score_laid(laid: AlignedGrids, map_resolution: float, aligned: bool, tolerance: int = 1) -> GridScores:
     """Score two maps on the same cells."""
     if not 0 <= tolerance <= 1000:
-        raise StereovoxError(f"tolerance {tolerance}: give the cells that are forgiven, 0 to 1000")
+        raise StereovoxError(f"tolerance {tolerance}: give a number of cells, 0 to 1000")
     here, there, counted = three_states(laid.map), three_states(laid.reference), ~laid.excluded
     known = (there != State.UNKNOWN) & counted
     both = known & (here != State.UNKNOWN)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of an estimated trajectory next to the true ones of the same times."""
+"""Poses of an estimated trajectory paired with the true ones of the same times."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
 TrajectoryLike = str | os.PathLike[str] | Poses | ImagePoses
 """A file of poses (TUM, KITTI, or another form of docs/recordings.md), or what was read from one."""
 MAX_DIFFERENCE_S = 0.02
-"""Poses further apart in time are no pair (TUM's associate.py)."""
+"""Poses farther apart in time are not paired (TUM's associate.py)."""
 MAX_GAP_S, MAX_GAP_INTERVALS = 1.0, 3.0
-"""The time between two estimated poses is not covered where it is longer than these seconds and so many of the usual
-interval between them, the median: keyframes are seconds apart."""
+"""The time between two estimated poses is a gap if it is longer than these seconds and than this many median intervals:
+keyframes are seconds apart."""
 MIN_PAIRS = 3
 MAX_DEFORMATION = 5e-3
 """Largest entry of abs(R^T R - I) that counts as rounding of a pose; the default of `pose_rigidity_tolerance`."""
@@ -33,13 +33,13 @@ MAX_DEFORMATION = 5e-3
 class PosePairs:
     """N pairs of an estimated and a true pose, in order.
 
-    stamps_ns: (N,) int64 nanoseconds of the estimate; None if the files have no times, and lines pair by number.
+    stamps_ns: (N,) int64 nanoseconds of the estimate; None if the files have no times; then lines pair by number.
     T_world_body, T_truth_body: (N, 4, 4) float64, estimated and true. estimate_poses, truth_poses: number of all poses
-    of each. coverage: share of the truth's time span in which there are estimated poses without a gap (see
-    MAX_GAP_S); without times, the share of the truth's poses that have a partner. estimate, truth: what they came
-    from, for messages. truth_positions: (K, 3) float64 metres of all true poses; truth_index: (N,) int64, which of them
-    are paired. truth_missed: (K,) bool, which of them lie where the estimate has no pose for longer than
-    MAX_GAP_INTERVALS of its usual intervals; without times, which have no partner.
+    of each. coverage: share of the truth's time span covered by estimated poses without a gap (see MAX_GAP_S); without
+    times, share of the truth's poses with a partner. estimate, truth: their origin, for messages. truth_positions: (K,
+    3) float64 metres of all true poses; truth_index: (N,) int64, indices of the paired ones. truth_missed: (K,) bool,
+    those in a gap of the estimate longer than MAX_GAP_INTERVALS of its usual intervals; without times, those without a
+    partner.
     """
 
     stamps_ns: NDArray[np.int64] | None
@@ -62,9 +62,9 @@ def pair_poses(estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s
     """Pair each pose of the sparser trajectory with the one of the other that is nearest in time (evo's rule).
 
     Poses without times pair by the number of their image, else by line.
-    max_difference_s: poses further apart in time are no pair; None: MAX_DIFFERENCE_S.
-    Raises StereovoxError, one line, for a file that cannot be read, a pose that is not rigid or holds NaN, fewer than
-    MIN_PAIRS pairs, where only one of the two has times, and where none has but `max_difference_s` is given.
+    max_difference_s: poses farther apart in time are not paired; None: MAX_DIFFERENCE_S.
+    Raises StereovoxError, one line, for a file that cannot be read, a pose that is not rigid or has NaN, fewer than
+    MIN_PAIRS pairs, times in only one of the two, and `max_difference_s` without times.
     """
     limit_s = MAX_DIFFERENCE_S if max_difference_s is None else max_difference_s
     if not 0 < limit_s < np.inf:
@@ -96,7 +96,7 @@ def pair_poses(estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s
 
 
 def _checked(poses: Poses | ImagePoses) -> NDArray[np.float64]:
-    """Return all poses (N, 4, 4); raises StereovoxError for the first that cannot be used."""
+    """Return all poses (N, 4, 4); raises StereovoxError for the first unusable one."""
     keys = poses.stamps_ns.tolist() if isinstance(poses, Poses) else range(len(poses))
     T = np.array([poses.at(key) for key in keys])
     for number, one in enumerate(T, 1):
@@ -129,7 +129,7 @@ def _by_number(ours: ImagePoses, true: ImagePoses) -> tuple[NDArray[np.int64], N
 
 
 def _covered(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
-    """Return the share of the truth's time span between poses of the estimate that have no gap between them."""
+    """Return the share of the truth's time span covered by estimated poses without gaps."""
     gaps = np.diff(ours_ns)
     if not len(gaps):
         return 0.0
@@ -139,7 +139,7 @@ def _covered(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
 
 
 def _missed(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which true poses (K,) lie in a gap of the estimate, before it or after it, that is too long."""
+    """Return which true poses (K,) are in too long a gap within, before or after the estimate."""
     limit_ns = MAX_GAP_INTERVALS * float(np.median(np.diff(ours_ns))) if len(ours_ns) > 1 else 0.0
     ends = np.concatenate([truth_ns[:1], ours_ns, truth_ns[-1:]])
     after = np.searchsorted(ours_ns, truth_ns) + 1

@@ -2,7 +2,7 @@
 """Errors of a robot's track on a floor: ATE, RPE, and known relations between pairs of poses; in space: see
 trajectory_score.py.
 
-Written by hand, because evo is GPL-3 and this is Apache-2.0.
+Our own implementation, because evo is GPL-3 and this is Apache-2.0.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import ns_from_seconds
 
 TOLERANCE_S = 0.05
-"""A relation whose times have no pose within this tolerance is not scored."""
+"""A relation is not scored if its times have no pose within this tolerance."""
 LEVER_M, MIN_LEVER_M = 0.3, 0.001
-"""Largest and smallest weight of headings in an alignment: that of a point this far ahead of the robot."""
+"""Largest and smallest weight of headings in an alignment: like a point this far ahead of the robot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Known motions of a robot, mostly between neighbouring times, some between revisits of a place.
+    """Known motions of a robot, mostly between consecutive times, some between visits of one place.
 
     stamps_ns: (N, 2) int64, the two times. motion: (N, 3) float64, pose_first_second (x, y, yaw).
     """
@@ -46,7 +46,7 @@ class Relations:
 class RelationErrors:
     """Differences between a trajectory's motions and the known ones.
 
-    metres, radians: (N,) absolute errors of the relations that have poses. missed: number of those without.
+    metres, radians: (N,) absolute errors of the relations with poses. missed: number of relations without.
     """
 
     metres: NDArray[np.float64]
@@ -54,7 +54,7 @@ class RelationErrors:
     missed: int
 
     def rows(self) -> dict[str, tuple[float, float]]:
-        """Return mean and standard deviation in the papers' units: m, degrees, m^2, degrees^2."""
+        """Return mean and standard deviation in the paper's units: m, degrees, m^2, degrees^2."""
         degrees = np.degrees(self.radians)
         table = {
             "absolute_m": self.metres,
@@ -130,7 +130,7 @@ def relation_errors(
 
 
 def nearest(stamps: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each query the index of the nearest of the rising stamps, of two equally near the earlier one."""
+    """Return for each query the index of the nearest of the rising stamps, the earlier one if two are equally near."""
     after = np.clip(np.searchsorted(stamps, queries), 1, max(len(stamps) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)
@@ -139,7 +139,7 @@ def nearest(stamps: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryError:
-    """Differences between N estimated poses and the true ones of the same times.
+    """Differences between N estimated poses and the true ones at the same times.
 
     position_rms_m to position_max_m: metres; yaw_rms_deg, yaw_max_deg: degrees (ATE).
     step_rms_m, step_yaw_rms_deg: of motions over `step_m` metres of the true path (RPE); None if it is shorter.
@@ -170,7 +170,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
     """Compare a track with true poses of the robot's base.
 
     align: first align the whole track with the true poses, rigidly and without scale (`best_motion`); for SLAM, whose
-    map has a frame of its own.
+    map has its own frame.
     step_m: metres along the true path over which motions are compared.
     Raises StereovoxError if no time of the track has a true pose.
     """
@@ -199,7 +199,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
 
 
 def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[se2.Pose, NDArray[np.bool_]]:
-    """Return (N, 3) true poses at these times, NaN if none is near enough, and (N,) whether one is."""
+    """Return (N, 3) true poses at these times, NaN if none is near enough, and a mask (N,) of those found."""
     poses = np.full((len(stamps_ns), 3), np.nan)
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         try:
@@ -212,7 +212,7 @@ def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[se2.Pose, ND
 def best_motion(poses_source: ArrayLike, poses_target: ArrayLike) -> se2.Pose:
     """Return (3,) pose_target_source that best aligns (N, 3) poses with (N, 3) others, by least squares (Horn 1987).
 
-    Nearly by positions alone, as usual; but where the robot hardly moved, positions do not determine the rotation, and
+    Positions dominate, as usual; but if the robot hardly moved, they do not determine the rotation, and
     headings do. So a heading counts like a point ahead of the robot, at a distance of the ratio of position to heading
     errors (metres per radian), at most LEVER_M.
     """
@@ -236,7 +236,7 @@ def _gaps(true: se2.Pose, found: se2.Pose) -> tuple[NDArray[np.float64], NDArray
 
 
 def _steps(poses: se2.Pose, true: se2.Pose, step_m: float) -> se2.Pose:
-    """Return the motions (M, 3) from each pose to the first that lies `step_m` further along the true path."""
+    """Return the motions (M, 3) from each pose to the first one `step_m` farther along the true path."""
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true[:, :2], axis=0).T))])
     end = np.searchsorted(travelled, travelled + step_m - 1e-9)
     start = np.flatnonzero(end < len(travelled))

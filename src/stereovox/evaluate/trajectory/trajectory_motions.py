@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the motions between poses of a trajectory: by frame, by second, and over segments (KITTI's rule).
 
-Poses are (N, 4, 4) float64 rigid motions in metres, `found` next to `true` ones.
+Poses are (N, 4, 4) float64 rigid motions in metres, `found` paired with `true` ones.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ def steps(found: Transforms, true: Transforms, start: NDArray[np.int64], end: ND
 
 
 def per_second(found: Transforms, true: Transforms, stamps_ns: NDArray[np.int64] | None) -> StepErrors | None:
-    """Return the errors of the motions from each pose to the one nearest to a second later; None if none is near.
+    """Return the errors of the motions from each pose to the one nearest to a second later; None if there is none.
 
-    stamps_ns: (N,) int64, not falling; None if they are not known.
+    stamps_ns: (N,) int64, ascending; None if unknown.
     """
     if stamps_ns is None:
         return None
@@ -90,13 +90,13 @@ def segment_errors(
 ) -> tuple[tuple[SegmentErrors, ...], tuple[float | None, float | None]]:
     """Return the errors by length, and the means over all segments (percent, degrees per metre; None without one).
 
-    KITTI's rule: from each START_EVERY-th pose to the first one that lies further along the truth than the length; the
+    KITTI's rule: from each START_EVERY-th pose to the first one farther along the truth than the length; the
     errors are divided by the length. travelled: (N,) metres, see `travelled_m`.
     """
     rows, shares, rates = [], [], []
     starts = np.arange(0, len(true), START_EVERY)
     for length in lengths_m:
-        end = np.searchsorted(travelled, travelled[starts] + length, side="right")  # the first that lies further on
+        end = np.searchsorted(travelled, travelled[starts] + length, side="right")  # the first one farther on
         fits = end < len(true)
         if not fits.any():
             continue
@@ -111,7 +111,7 @@ def segment_errors(
 
 
 def mean_angle_deg(T: Transforms) -> float:
-    """Return the angle in degrees of the mean rotation, that nearest to the mean matrix, of (N, 4, 4) motions."""
+    """Return the angle in degrees of the mean rotation, nearest to the mean matrix, of (N, 4, 4) motions."""
     return float(angles_deg(orthonormalise(T.mean(axis=0))[None])[0])
 
 

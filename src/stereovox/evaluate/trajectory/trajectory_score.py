@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of an estimated trajectory in space: ATE, RPE by frame, second and distance, drift.
 
-Written by hand, because evo is GPL-3 and this is Apache-2.0; the tests compare the figures with evo's.
+Our own implementation, because evo is GPL-3 and this is Apache-2.0; the tests compare its figures with evo's.
 """
 
 from __future__ import annotations
@@ -34,27 +34,26 @@ KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 SHORT_SEGMENTS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """Segments of trajectories shorter than the first of KITTI's."""
 MIN_EXTENT_M = 1e-3
-"""A trajectory that stays this close to its middle cannot be aligned."""
+"""A trajectory within this distance of its middle cannot be aligned."""
 STRAIGHT = 1e-9
-"""Covariance across a trajectory, relative to that along it, below which positions leave the roll about it open."""
+"""Ratio of covariance across to along a trajectory below which positions do not determine the roll about it."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryScore:
     """Differences between an estimated trajectory and the true one.
 
-    pairs: the N pairs of poses, the estimated ones as they stand. T_truth_world: (4, 4) float64, what they were aligned
-    by, and scale, by which their positions were multiplied before; identity and 1 where they were not.
-    position_errors_m, rotation_errors_deg: (N,) float64 of the aligned poses; position_m (ATE) and rotation_deg are
-    their figures. rotation_offset_deg: what the rotation errors have in common, the angle of their mean: large where
-    the two do not follow the same axes of the body, or where positions nearly on a line leave the roll about it open.
+    pairs: the N pairs of poses, with the estimate unaligned. T_truth_world: (4, 4) float64, the alignment, and scale,
+    the factor on positions before it; identity and 1 without alignment. position_errors_m, rotation_errors_deg: (N,)
+    float64 of the aligned poses; position_m (ATE) and rotation_deg are their figures. rotation_offset_deg: the angle of
+    the mean rotation error: large if the two follow different body axes, or if positions nearly on a line leave the
+    roll about it open.
     length_m: of the truth, through its paired poses. duration_s: None without times.
     per_frame: RPE from each pair to the next. per_second: to the pair nearest to one second later (0.9 to 1.1 s); None
     if there is none.
-    segments: by their length, of those lengths that fit into the trajectory. translation_percent, rotation_deg_per_m:
-    means over all of them; None without segments.
-    drift_percent: by how much the end is off, in position, where the starts are laid on each other, of length_m; None
-    if the truth stands still.
+    segments: by length, for lengths that fit into the trajectory. translation_percent, rotation_deg_per_m: means over
+    all of them; None without segments. drift_percent: position error at the end after aligning the start, relative to
+    length_m; None if the truth stands still.
     """
 
     pairs: PosePairs
@@ -118,19 +117,20 @@ def score_trajectory(
 
     Args:
         estimate: File of poses (TUM lines, KITTI's 12 numbers, ...), or `Poses` or `ImagePoses` read from one: poses of
-            a body in a world of its own, metres.
+            a body in its own world, metres.
         truth: The same for the true poses of the same body.
         align: Align the estimate first, rigidly, by least squares of positions. False: both are in one frame.
-        scale: Fit the scale, too (one camera without metres).
-        max_difference_s: Poses further apart in time are no pair; by default 0.02 s.
-        segments_m: Lengths in metres of KITTI's segments. By default 100 to 800 m where the truth is longer than
-            100 m, and 1, 2, 5, 10, 20, 50 m if it is not.
+        scale: Also fit the scale (one camera without metres).
+        max_difference_s: Poses farther apart in time are not paired; by default 0.02 s.
+        segments_m: Lengths in metres of KITTI's segments. By default 100 to 800 m if the truth is longer than
+            100 m, else 1, 2, 5, 10, 20, 50 m.
 
     Returns:
-        The errors; position and rotation errors (ATE) after alignment, motions (RPE) independent of it but for scale.
+        The errors; position and rotation errors (ATE) after alignment, motions (RPE) independent of it except for
+        scale.
 
     Raises:
-        StereovoxError: One line: too few pairs, a pose that cannot be used, too little motion to align, a
+        StereovoxError: One line: too few pairs, an unusable pose, too little motion to align, a
             `max_difference_s` for poses without times.
     """
     if scale and not align:
@@ -175,8 +175,8 @@ def score_trajectory(
 def best_alignment(pairs: PosePairs, scale: bool = False) -> tuple[Transform, float]:
     """Return T_truth_world (4, 4), and the factor of positions before it, that align estimated poses with true ones.
 
-    Least squares of positions (Umeyama 1991, Eq 38 to 43). Where they lie on a straight line, which leaves the roll
-    about it open, rotations decide that.
+    Least squares of positions (Umeyama 1991, Eq 38 to 43). If they lie on a straight line, which leaves the roll about
+    it open, rotations determine it.
     Raises StereovoxError if one of the two stands still.
     """
     ours, true = pairs.T_world_body[:, :3, 3], pairs.T_truth_body[:, :3, 3]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers in a map's cells, and the pools that hold them."""
+"""Cell values of a map, and the pools that hold them."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that weigh a frame's evidence against the blocks of a map, and add it to them.
+"""Kernels that compare a frame's evidence with the blocks of a map, and add it to them.
 
-`places` looks where the blocks of the evidence are, `make_rows` makes the rows that are missing, `add` fills them, on
-any number of threads, and `settle` takes the rows from blocks that have sunk to the floor. The evidence is `coords`
-(n, 3) with `values` (n, 512) int16, then `uniform` (m, 3), all of whose cells get one negative step each.
+`places` finds the blocks of the evidence, `make_rows` creates missing rows, `add` fills them, on any number of threads,
+and `settle` removes the rows of blocks that have sunk to the floor value. The evidence is `coords` (n, 3) with `values`
+(n, 512) int16, then `uniform` (m, 3), all of whose cells get one negative step each.
 """
 
 import numpy as np
@@ -16,19 +16,19 @@ from stereovox.maps.cells._pool import BARE, make_bare, need, new_row, with_row
 NONE, NIL = np.int32(0), np.int16(0)
 MIX_X, MIX_Y, MIX_Z = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32(0xC2B2AE3D)
 SHIFT = np.uint32(16)
-"""Low bits of a product depend on low bits alone; those from here on on all."""
+"""Low bits of a product depend only on low bits; bits from here up depend on all."""
 
 
 @kernel
 def weigh(stored, sure, least, coords, values, uniform, steps, mask, out):
-    """Write the weights (in the units of `values`) of what is said of sure cells to `out` (5,) float64.
+    """Write the weights of the evidence on certain cells, in the units of `values`, to `out` (5,) float64.
 
-    out: for cells that are occupied (hits), against such that are surely so (looked through), against cells that are
-    surely free (hits), those of them that are next to an unknown cell of their block, and of all hits, whatever the map
-    says. Hits below `least` are for cells, but not against them. sure: (surely free up to, occupied from, surely
-    occupied from). coords (n, 3) with values (n, 512) int16, then uniform (m, 3), all of whose cells get one of
-    `steps` (m,) each. Looks only at blocks whose hash ends in zeros where `mask` has ones: which these are does not
-    depend on their order.
+    out: evidence for occupied cells (hits), against certainly occupied cells (looked through), against certainly free
+    cells (hits), the part of the latter next to an unknown cell of their block, and all hits, whatever the map holds.
+    Hits below `least` count for cells, but not against them. sure: (certainly free up to, occupied from, certainly
+    occupied from). coords (n, 3) with values (n, 512) int16, then uniform (m, 3), all of whose cells get one of `steps`
+    (m,) each. Only blocks whose hash has zeros where `mask` has ones are inspected: the choice does not depend on their
+    order.
     """
     hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(coords.shape[0]):
@@ -45,7 +45,7 @@ def weigh(stored, sure, least, coords, values, uniform, steps, mask, out):
 
 @cell
 def weighed(stored, sure, least, coords, i, said):
-    """Return the five weights, as in `weigh`, of what is `said` (512,) of block `i` of `coords`."""
+    """Return the five weights, as in `weigh`, of evidence `said` (512,) on block `i` of `coords`."""
     row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
     if row >= 0:
         hits, passes, into, every = _of_row(said, least, stored.values[row], sure)
@@ -60,23 +60,23 @@ def weighed(stored, sure, least, coords, i, said):
 
 @cell
 def looked_through(stored, sure, coords, i, step):
-    """Return what weighs against surely occupied cells where all cells of block `i` of `coords` get a step."""
+    """Return the weight against certainly occupied cells if all cells of block `i` of `coords` get a step."""
     row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
     return -np.int64(step) * _occupied(stored.values[row], sure) if row >= 0 else np.int64(0)
 
 
 @cell
 def chosen(coords, i, mask):
-    """Tell whether block `i` of `coords` is one of those looked at; see `weigh`."""
+    """Return whether block `i` of `coords` is inspected; see `weigh`."""
     mixed = np.uint32(coords[i, 0]) * MIX_X ^ np.uint32(coords[i, 1]) * MIX_Y ^ np.uint32(coords[i, 2]) * MIX_Z
     return (np.uint32(mixed >> SHIFT) & mask) == 0
 
 
 @cell
 def _of_row(said, least, cells, sure):
-    """Return what (512,) evidence weighs for and against occupied cells, against free ones, and all its firm hits.
+    """Return the weights of (512,) evidence for and against occupied cells, against free ones, and of its firm hits.
 
-    All numbers but the sums are int16: twice as many cells in one instruction.
+    All but the sums are int16: twice as many cells per instruction.
     """
     hits, passes, into, every = NONE, NONE, NONE, NONE
     for c in range(512):
@@ -92,7 +92,7 @@ def _of_row(said, least, cells, sure):
 
 @cell
 def _at_edge(said, least, cells, unknown, sure):
-    """Return what (512,) evidence weighs against free cells that are next to an unknown one of the same block."""
+    """Return the weight of (512,) evidence against free cells next to an unknown one of the same block."""
     weight = NONE
     for c in range(512):
         if (said[c] >= least) & (np.int16(cells[c]) <= sure[0]):
@@ -117,7 +117,7 @@ def _hits(said, least):
 
 @cell
 def _occupied(cells, sure):
-    """Return how many cells (512,) are surely occupied."""
+    """Return how many cells (512,) are certainly occupied."""
     number = NONE
     for c in range(512):
         number = np.int32(number + (np.int32(1) if np.int16(cells[c]) >= sure[2] else NONE))
@@ -125,7 +125,7 @@ def _occupied(cells, sure):
 
 
 SKIP, MAKE = np.int32(-1), np.int32(-2)
-"""In place of a row: the evidence changes nothing in this block; it needs a row."""
+"""Instead of a row: the evidence changes nothing in this block; the block needs a row."""
 LOW, HIGH = np.int64(-32768), np.int64(32767)
 NIL, ONE = np.int16(0), np.int16(1)
 ZERO = np.float32(0)
@@ -133,9 +133,9 @@ ZERO = np.float32(0)
 
 @kernel
 def places(table, coords, values, wanted, steps, uniform, out):
-    """Write the row of each block, or SKIP, or MAKE, to `out` (n + m,) int32; return the number of rows to make.
+    """Write the row of each block, or SKIP, or MAKE, to `out` (n + m,) int32; return the number of rows to create.
 
-    A block at the floor stays as it is unless something in it rises; one without any evidence is not made.
+    A block at the floor value is unchanged unless a cell rises; one without any evidence is not created.
     """
     rows, n, made = values.shape[0], wanted.shape[0], 0
     for i in range(n):
@@ -159,7 +159,7 @@ def places(table, coords, values, wanted, steps, uniform, out):
 
 @kernel
 def make_rows(table, coords, values, count, wanted, unknown, lowest, rows):
-    """Make a row for each block of `wanted` (n, 3) marked MAKE in `rows` (n,), and write it there."""
+    """Create a row for each block of `wanted` (n, 3) marked MAKE in `rows` (n,), and write its index there."""
     for i in range(rows.size):
         if rows[i] == MAKE:
             place = _find(table, coords, wanted, i)
@@ -175,7 +175,7 @@ def add(values, rows, start, stop, steps, uniform_steps, same, unknown, prior, l
     """Add the evidence of blocks `start` to `stop`; return how many cells changed.
 
     All numbers are int16: steps (n, 512), uniform_steps (m,), and `same` (512,), scratch. `floored` (n + m,) is set to
-    1 for blocks whose cells are all at the floor now.
+    1 for blocks whose cells are now all at the floor value.
     """
     changed, n = 0, steps.shape[0]
     for i in range(start, stop):
@@ -191,7 +191,7 @@ def add(values, rows, start, stop, steps, uniform_steps, same, unknown, prior, l
 
 @kernel
 def settle(table, coords, values, count, wanted, floored, unknown, lowest):
-    """Take the rows from the blocks of `wanted` (n, 3) marked in `floored` (n,)."""
+    """Remove the rows of the blocks of `wanted` (n, 3) marked in `floored` (n,)."""
     for i in range(floored.size):
         if floored[i]:
             row = _find(table, coords, wanted, i)
@@ -203,7 +203,7 @@ def settle(table, coords, values, count, wanted, floored, unknown, lowest):
 def rescale(values, factor, shift, most, out):
     """Write `values` (n, 512) times `factor`, plus `shift`, rounded down to whole numbers, to `out` (n, 512) int16.
 
-    None is more than `most`.
+    Values are capped at `most`.
     """
     for i in range(values.shape[0]):
         for c in range(512):
@@ -212,14 +212,14 @@ def rescale(values, factor, shift, most, out):
 
 @cell
 def rescaled(value, factor, shift, most):
-    """Return what `rescale` makes of one cell's evidence."""
+    """Return one cell's evidence as `rescale` does."""
     value = np.float32(value)
     return np.int16(min(floor(value * factor + shift), most) if value != ZERO else ZERO)
 
 
 @cell
 def _add_to_row(block, steps, unknown, prior, lowest, highest):
-    """Add `steps` (512,) to the cells of a block; return how many changed, and 0 if all are at the floor now."""
+    """Add `steps` (512,) to the cells of a block; return how many changed, and 0 if all are now at the floor value."""
     moved, above = NIL, NIL
     for c in range(512):
         old = np.int16(block[c])
@@ -232,9 +232,9 @@ def _add_to_row(block, steps, unknown, prior, lowest, highest):
 
 @cell
 def added_step(old, step, unknown, prior, lowest, highest):
-    """Return what `_cells.added` says, all in int16: twice as many cells in one instruction.
+    """Do as `_cells.added`, all in int16: twice as many cells per instruction.
 
-    The compiler makes of the first clamp an addition that saturates.
+    The compiler turns the first clamp into a saturating addition.
     """
     start = prior if old == unknown else old
     total = np.int16(min(max(np.int64(start) + np.int64(step), LOW), HIGH))

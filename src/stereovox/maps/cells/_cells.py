@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel cells: where a block lies in its pool, and what evidence makes of one of its cells."""
+"""Kernel cells: the row of a block in its pool, and the update of one cell by evidence."""
 
 import numpy as np
 
 from stereovox.kernels._jit import cell
 
 UNKNOWN, FREE, TENTATIVE, OCCUPIED = 0, 1, 2, 3
-"""What a map says about a cell; see `State`."""
+"""States of a cell; see `State`."""
 EMPTY, NIL = np.int32(-1), np.int16(0)
 NO_ROW, AT_FLOOR = np.int64(-1), np.int64(-2)
-"""In place of a row of values: the block is not there; all its cells hold the lowest number there is."""
+"""Instead of a row of values: the block does not exist; all its cells have the lowest value."""
 
 
 @cell
 def added(old, step, unknown, prior, lowest, highest):
-    """Return what a cell holds after evidence `step`, clamped; all int32.
+    """Return the value of a cell after evidence `step`, clamped; all int32.
 
-    One without evidence, `unknown`, starts from `prior`; where a sum comes to just `unknown`, one more is stored.
+    A cell without evidence, `unknown`, starts from `prior`; a sum of exactly `unknown` is stored as one more.
     """
     start = prior if old == unknown else old
     new = min(max(np.int32(start + step), lowest), highest)
@@ -26,7 +26,7 @@ def added(old, step, unknown, prior, lowest, highest):
 
 @cell
 def says_something(steps):
-    """Tell whether evidence (512,) int16 on a block is anything but zeros."""
+    """Return whether evidence (512,) int16 on a block is anything but zeros."""
     anything = NIL
     for c in range(512):
         anything = np.int16(anything | steps[c])
@@ -35,7 +35,7 @@ def says_something(steps):
 
 @cell
 def copy_row(target, source):
-    """Copy `source` (n,) to `target` (n,). Numba's `target[:] = source` would take memory, which no kernel may."""
+    """Copy `source` (n,) to `target` (n,). Numba's `target[:] = source` would allocate, which no kernel may."""
     for c in range(target.size):
         target[c] = source[c]
 
@@ -53,14 +53,14 @@ def home_slot(bx, by, bz, mask):
 
 @cell
 def find(table, coords, bx, by, bz):
-    """Return the pool index of block (bx, by, bz), -1 when there is none."""
+    """Return the pool index of block (bx, by, bz), -1 if there is none."""
     slot = slot_of(table, coords, bx, by, bz)
     return np.int64(table[slot]) if slot >= 0 else np.int64(-1)
 
 
 @cell
 def row_of(stored, bx, by, bz):
-    """Return the row that holds the cells of block (bx, by, bz), or NO_ROW, or AT_FLOOR; see `StoredCells`."""
+    """Return the row with the cells of block (bx, by, bz), or NO_ROW, or AT_FLOOR; see `StoredCells`."""
     place = find(stored.table, stored.coords, bx, by, bz)
     return AT_FLOOR if place >= stored.values.shape[0] else place
 
@@ -75,7 +75,7 @@ def number_in(stored, row, x, y, z):
 
 @cell
 def slot_of(table, coords, bx, by, bz):
-    """Return the slot of the hash table that holds block (bx, by, bz), -1 when there is none."""
+    """Return the slot of the hash table that holds block (bx, by, bz), -1 if there is none."""
     mask = table.size - 1
     slot = home_slot(bx, by, bz, mask)
     while True:
@@ -89,7 +89,7 @@ def slot_of(table, coords, bx, by, bz):
 
 @cell
 def enter(table, coords, place):
-    """Enter the block at `place`, which the table does not know."""
+    """Insert the block at `place`, which the table does not contain."""
     mask = table.size - 1
     slot = home_slot(coords[place, 0], coords[place, 1], coords[place, 2], mask)
     while table[slot] != EMPTY:
@@ -99,7 +99,7 @@ def enter(table, coords, place):
 
 @cell
 def empty_slot(table, coords, slot):
-    """Empty a slot of the hash table and close the gap: entries behind it move up if their search passes it."""
+    """Empty a slot of the hash table and close the gap: later entries move up if their search passes it."""
     mask = table.size - 1
     gap, slot = slot, (slot + 1) & mask
     while table[slot] != EMPTY:
@@ -114,7 +114,7 @@ def empty_slot(table, coords, slot):
 
 @cell
 def find_or_insert(table, coords, count, bx, by, bz):
-    """Return the pool index of block (bx, by, bz), making it when needed; -1 when the pool is full.
+    """Return the pool index of block (bx, by, bz), creating it if needed; -1 if the pool is full.
 
     `count` is a (1,) int64 array: the number of blocks in the pool.
     """

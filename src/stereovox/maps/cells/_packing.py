@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that turn an image into bytes that compress well, and back without loss."""
+"""Kernels that turn an image into easily compressed bytes, and back without loss."""
 
 from stereovox.kernels._jit import kernel
 
@@ -8,7 +8,7 @@ from stereovox.kernels._jit import kernel
 def split(bits, planes):
     """Write the differences between neighbouring numbers as planes of bytes, the lowest bytes first.
 
-    Each number (h, w) uint16 or uint32 less the one to its left, in the first column the one above; small negative
+    Each number (h, w) uint16 or uint32 minus the one to its left, in the first column the one above; small negative
     differences become small numbers (zigzag). planes: (2 or 4, h, w) uint8.
     """
     last = 8 * planes.shape[0] - 1
@@ -25,7 +25,7 @@ def split(bits, planes):
 
 @kernel
 def join(planes, bits):
-    """Undo `split`: write the numbers (h, w) of which it made these planes."""
+    """Undo `split`: write the numbers (h, w) that it split into these planes."""
     mask = (2 << (8 * planes.shape[0] - 1)) - 1
     for v in range(bits.shape[0]):
         for u in range(bits.shape[1]):

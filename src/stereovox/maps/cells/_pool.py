@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels over the blocks of a map: blocks come, go, lose their row of numbers and get one again; see `CellPool`.
+"""Kernels over the blocks of a map: add and remove blocks, and their rows of numbers; see `CellPool`.
 
-Every kernel takes the pool as four arrays: `table`, `coords`, `values`, `count`. A place below `len(values)` is that of
-a row, a place from there on that of a bare block. The caller has made room.
+Every kernel takes the pool as four arrays: `table`, `coords`, `values`, `count`. A place below `len(values)` is a row,
+a place from there on a bare block. The caller has made room.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from stereovox.maps.cells._cells import EMPTY, copy_row, empty_slot, enter, find
 
 @kernel
 def rebuild_all(table, coords, n):
-    """Enter the first `n` blocks of the pool into an empty hash table."""
+    """Insert the first `n` blocks of the pool into an empty hash table."""
     table[:] = EMPTY
     for i in range(n):
         enter(table, coords, i)
@@ -21,18 +21,18 @@ def rebuild_all(table, coords, n):
 
 @kernel
 def insert_all(table, coords, count, wanted, indices):
-    """Find or make every block of `wanted` (n, 3); write pool indices to `indices` (n,)."""
+    """Find or create every block of `wanted` (n, 3); write pool indices to `indices` (n,)."""
     for i in range(wanted.shape[0]):
         indices[i] = find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
 
 
 NOTHING, BARE, ROW = np.uint8(0), np.uint8(1), np.uint8(2)
-"""What a block of cells needs: no place at all, as none is known; a bare one, as all are at the floor; a row."""
+"""What a block of cells needs: nothing (no cell is known), a bare place (all at the floor value), or a row."""
 
 
 @kernel
 def rebuild(table, coords, values, count):
-    """Enter all blocks of the pool into the hash table anew."""
+    """Rebuild the hash table from all blocks of the pool."""
     table[:] = EMPTY
     for row in range(count[0]):
         enter(table, coords, row)
@@ -49,7 +49,7 @@ def needs(cells, unknown, lowest, out):
 
 @kernel
 def put(table, coords, values, count, wanted, cells, kinds):
-    """Set blocks `wanted` (n, 3) to `cells` (n, 512), each with what it needs by `kinds` (n,)."""
+    """Set blocks `wanted` (n, 3) to `cells` (n, 512), each stored according to `kinds` (n,)."""
     for i in range(wanted.shape[0]):
         x, y, z = wanted[i, 0], wanted[i, 1], wanted[i, 2]
         forget(table, coords, values, count, x, y, z)
@@ -64,7 +64,7 @@ def put(table, coords, values, count, wanted, cells, kinds):
 
 @kernel
 def remove(table, coords, values, count, gone):
-    """Forget blocks `gone` (n, 3), each there or not."""
+    """Remove blocks `gone` (n, 3), whether present or not."""
     for i in range(gone.shape[0]):
         forget(table, coords, values, count, gone[i, 0], gone[i, 1], gone[i, 2])
 
@@ -91,7 +91,7 @@ def need(block, unknown, lowest):
 
 @cell
 def new_row(table, coords, count, x, y, z):
-    """Make the row of a block that is not there, its numbers yet to be written; return it."""
+    """Create and return the row of a missing block; its numbers are yet to be written."""
     row = count[0]
     coords[row, 0], coords[row, 1], coords[row, 2] = x, y, z
     enter(table, coords, row)
@@ -101,7 +101,7 @@ def new_row(table, coords, count, x, y, z):
 
 @cell
 def with_row(table, coords, values, count, place, lowest):
-    """Return the row of the block at `place`, which gets one if it is bare."""
+    """Return the row of the block at `place`, creating one if it is bare."""
     if place < values.shape[0]:
         return place
     row = count[0]
@@ -114,7 +114,7 @@ def with_row(table, coords, values, count, place, lowest):
 
 @cell
 def make_bare(table, coords, values, count, row):
-    """Take its row from a block whose cells are all at the floor; another block may get that row."""
+    """Remove the row of a block whose cells are all at the floor value; another block may get that row."""
     _move(table, coords, row, values.shape[0] + count[1])
     count[1] += 1
     _close_row_gap(table, coords, values, count, row)
@@ -122,7 +122,7 @@ def make_bare(table, coords, values, count, row):
 
 @cell
 def forget(table, coords, values, count, x, y, z):
-    """Take block (x, y, z), there or not, out of the pool."""
+    """Remove block (x, y, z) from the pool, whether present or not."""
     slot = slot_of(table, coords, x, y, z)
     if slot >= 0:
         place = np.int64(table[slot])
@@ -135,7 +135,7 @@ def forget(table, coords, values, count, x, y, z):
 
 @cell
 def _move(table, coords, old, new):
-    """Give the block at place `old` the place `new`."""
+    """Move the block at place `old` to place `new`."""
     table[slot_of(table, coords, coords[old, 0], coords[old, 1], coords[old, 2])] = new
     coords[new, 0], coords[new, 1], coords[new, 2] = coords[old, 0], coords[old, 1], coords[old, 2]
 

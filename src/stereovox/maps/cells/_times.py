@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels over the times of cells: evidence renews them, blocks go, cells without evidence for long are found.
+"""Kernels over the times of cells: renew them by evidence, remove blocks, find cells long without evidence.
 
 Every kernel takes the times as three arrays and a number: `table`, `coords`, `times` (rows, 512) uint32 and `count`
 (1,). The caller has made room. Rows that are not in use hold zeros.
@@ -14,12 +14,12 @@ from stereovox.maps.cells._pool import forget
 NEVER = np.uint32(0)
 NIL = np.int16(0)
 SLOTS = 64
-"""Turns in which all blocks are looked at once; which one a block has is a hash of its coordinates."""
+"""Turns in which each block is inspected once; a block's turn is a hash of its coordinates."""
 
 
 @kernel
 def missing(table, coords, wanted, values, uniform):
-    """Return how many blocks of evidence have no times so far: `wanted` (n, 3) with any `values`, `uniform` (m, 3)."""
+    """Return how many blocks of evidence have no times yet: `wanted` (n, 3) with any `values`, `uniform` (m, 3)."""
     number = 0
     for i in range(wanted.shape[0]):
         number += says_something(values[i]) and find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2]) < 0
@@ -46,14 +46,14 @@ def write(table, coords, times, count, wanted, values, uniform, now):
 
 @kernel
 def remove(table, coords, times, count, gone):
-    """Forget the times of blocks `gone` (n, 3), each there or not."""
+    """Remove the times of blocks `gone` (n, 3), whether present or not."""
     for i in range(gone.shape[0]):
         _remove(table, coords, times, count, gone[i, 0], gone[i, 1], gone[i, 2])
 
 
 @kernel
 def follow(table, coords, times, count, cells_table, cells_coords, low, high):
-    """Forget the times of those blocks within cells [low, high), (3,) int32 each, that the map has no cells of."""
+    """Remove the times of blocks within cells [low, high), (3,) int32 each, of which the map has no cells."""
     for bx in range(low[0] >> 3, ((high[0] - 1) >> 3) + 1):
         for by in range(low[1] >> 3, ((high[1] - 1) >> 3) + 1):
             for bz in range(low[2] >> 3, ((high[2] - 1) >> 3) + 1):
@@ -63,9 +63,9 @@ def follow(table, coords, times, count, cells_table, cells_coords, low, high):
 
 @kernel
 def due(coords, times, count, first, turns, now, most, out):
-    """Write the places of blocks with a time more than `most` away from `now` to `out`; return how many they are.
+    """Write the places of blocks with a time more than `most` away from `now` to `out`; return their number.
 
-    Only those of the next `turns` turns from `first` on are looked at.
+    Only the blocks of the `turns` turns from `first` on are inspected.
     """
     number = 0
     for row in range(count[0]):
@@ -88,7 +88,7 @@ def _remove(table, coords, times, count, x, y, z):
 
 @cell
 def _any_past(times, now, most):
-    """Tell whether a time is too far from `now`, before or after it; all uint32."""
+    """Return whether a time is too far from `now`, before or after it; all uint32."""
     past = np.uint32(0)
     for c in range(512):
         away = np.uint32(max(times[c], now) - min(times[c], now))

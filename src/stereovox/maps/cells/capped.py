@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map without bounds in space that takes no more memory than `max_memory`: what needs more is refused."""
+"""A map without spatial bounds but within `max_memory`: frames that need more are refused."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from stereovox.maps.voxel_map import VoxelMap
 class CappedStorage(Storage):
     """The blocks of a map that refuses frames, as `memory_full`, if they need more blocks than fit into `max_memory`.
 
-    Room for all of these is set aside at the start, so nothing is ever copied to grow; the system gives the memory of a
-    block when it is first used. What is refused depends only on the cells and the frame. Raises ConfigError if not
-    even one block fits.
+    Room for all blocks is reserved at the start, so nothing is ever copied to grow; the system provides a block's
+    memory on first use. Refusals depend only on the cells and the frame. Raises ConfigError if not even one block fits.
     """
 
     bounded = True
@@ -30,7 +29,7 @@ class CappedStorage(Storage):
         self._times = CellTimes(config.map, self._most) if config.map.keep_times else None
 
     def go_on_with(self, earlier: Storage) -> None:
-        """Start from the cells of a map made before. Raises ConfigError if they do not fit."""
+        """Start from the cells of an earlier map. Raises ConfigError if they do not fit."""
         earlier.check_cells(self.config)
         for coords, cells in earlier.slabs():
             rows, bare = self._pool.needed_by(cells)
@@ -45,10 +44,10 @@ class CappedStorage(Storage):
         self.take_history(earlier)
 
     def check_room(self, evidence: Evidence) -> None:
-        """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
+        """Raise FrameRefused `memory_full` if `evidence` needs more memory than the map may take."""
         mine = self._in_my_units(evidence)
         needed = max(self._pool.needed_for(mine.coords, mine.values, mine.uniform))
-        if self._times is not None:  # any block may come to need numbers again when cells are forgotten
+        if self._times is not None:  # forgetting cells can make any block need numbers again
             needed = max(needed, len(self._pool) + self._times.missing(mine))
         if needed > self._most:
             raise FrameRefused(
@@ -59,7 +58,7 @@ class CappedStorage(Storage):
 
 
 class CappedMap(VoxelMap):
-    """A map without bounds in space within `max_memory`; see `CappedStorage`. Raises ConfigError as that does."""
+    """A map without spatial bounds within `max_memory`; see `CappedStorage`. Raises ConfigError as that does."""
 
     storage: CappedStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
 

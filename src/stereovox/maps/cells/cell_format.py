@@ -17,9 +17,9 @@ from stereovox.errors import ConfigError
 from stereovox.maps.cells import _cells
 
 BYTE_THRESHOLD = 180
-"""Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken to stand for a probability of 0.7."""
+"""Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken as a probability of 0.7."""
 LIKELY = 0.7
-"""Probability that lies half a way or more before what is surely occupied, however low the threshold."""
+"""Lower bound on the probability that counts as certainly occupied, however low the threshold."""
 
 
 class State(IntEnum):
@@ -42,7 +42,7 @@ class State(IntEnum):
 class CellFormat:
     """Stored number = `unknown` + log-odds * `per_log_odds`, rounded and cut to the type's range.
 
-    drift: what `shift` moves by from frame to frame.
+    drift: change of `shift` from frame to frame.
     """
 
     dtype: np.dtype
@@ -61,19 +61,19 @@ class CellFormat:
         return (stored.astype(np.float32) - np.float32(self.unknown)) / np.float32(self.per_log_odds)
 
     def shift(self, frame: int) -> float:
-        """Return what is added to the evidence of a frame, in stored numbers, before it is rounded down: 0 to 1.
+        """Return the offset added to a frame's evidence, in stored numbers, before it is rounded down: 0 to 1.
 
-        A half rounds to the nearest number. Where it drifts by the golden ratio, evidence of a tenth of a step counts
-        as a whole one in every tenth frame: nothing weak is lost, nothing is counted double, and no number is drawn.
+        A half rounds to the nearest number. If it drifts by the golden ratio, evidence of a tenth of a step counts as a
+        whole one in every tenth frame: weak evidence is not lost, none is counted twice, and nothing is random.
         """
         return (0.5 + frame * self.drift) % 1.0
 
 
 class Thresholds(NamedTuple):
-    """The stored numbers, other than "unknown", that tell the states apart, as kernels read them."""
+    """The stored numbers, other than "unknown", that separate the states, as kernels read them."""
 
-    free_most: np.int32  # free up to it
-    occupied_least: np.int32  # occupied from it on
+    free_most: np.int32  # free up to this
+    occupied_least: np.int32  # occupied from this on
 
 
 @dataclass(frozen=True)
@@ -102,26 +102,26 @@ class CellRules:
 
     @cached_property
     def prior(self) -> np.int32:
-        """Stored number from which a cell starts with its first evidence, within the limits of all cells."""
+        """Stored number from which a cell starts with its first evidence, within the limits."""
         p = self.config.prior
         return np.int32(np.clip(self.format.stored(log(p / (1 - p))), self.lowest, self.highest))
 
     @cached_property
     def free_below(self) -> float:
-        """Stored numbers below it are free: unlikely, and no likelier than before the first evidence."""
+        """Stored numbers below this are free: unlikely, and no likelier than before the first evidence."""
         return min(self._exact(self.config.free_below), float(self.prior) + 0.5)
 
     @cached_property
     def occupied_above(self) -> float:
-        """Stored numbers above it are occupied."""
+        """Stored numbers above this are occupied."""
         return self._exact(self.config.occupied_above)
 
     @cached_property
     def most_rise(self) -> int | None:
-        """Most that one frame may add to a cell, so that `confirm_hits` frames must hit it; None: whatever they say.
+        """Most that one frame may add to a cell, so that `confirm_hits` frames must hit it; None: no limit.
 
-        Fewer frames never make an unknown cell occupied, which starts from the prior and skips "unknown" by one. Where
-        numbers are too coarse for exactly as many, it takes more. Raises ConfigError if they are far too coarse.
+        Fewer frames never make an unknown cell occupied, although it starts from the prior and skips "unknown" by one.
+        If numbers are too coarse for exactly that many, more are needed. Raises ConfigError if they are far too coarse.
         """
         frames = self.config.confirm_hits
         if frames == 1:
@@ -142,10 +142,10 @@ class CellRules:
 
     @cached_property
     def sure(self) -> tuple[np.int16, np.int16, np.int16]:
-        """The highest stored number that is surely free, the lowest occupied one, and the lowest surely occupied one.
+        """The highest certainly free stored number, the lowest occupied one, and the lowest certainly occupied one.
 
-        Sure is what lies past the middle between its threshold, and at least LIKELY, and its limit. None is "unknown",
-        nor beyond it.
+        Certain means past the middle between its threshold, and at least LIKELY, and its limit. No certain number is
+        "unknown" or beyond it.
         """
         unknown, (free_most, occupied_least) = self.format.unknown, map(int, self.thresholds)
         surely_free = min((free_most + int(self.lowest)) // 2, unknown - 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All blocks of a voxel map: those with a row of numbers, and bare ones, whose cells are all as free as can be."""
+"""All blocks of a voxel map: those with a row of numbers, and bare ones, whose cells are all as free as possible."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.storage.blocks import CELLS, StoredCells, table_size
 
 GROWTH = 1.5
-"""A pool that is full becomes so many times as large; one that is SPARE times too large shrinks to as much."""
+"""A full pool grows by this factor; one that is SPARE times too large shrinks to this many times its use."""
 SPARE = 4
 PIECE = 1024
-"""Blocks that `pieces` yields at once."""
+"""Most blocks that `pieces` yields at once."""
 WORTH_A_THREAD = 2048
-"""Blocks of evidence that take as long as it takes to wake a thread."""
+"""Blocks of evidence whose work takes as long as waking a thread."""
 
 
 class CellPool:
     """Blocks of 8x8x8 cells by their coordinates; cell (i, j, k) of a block is number `64 i + 8 j + k` of 512.
 
-    A block none of whose cells is known is not kept. One whose cells all hold the lowest number, as most of the empty
-    space of a room does, is bare: it has coordinates, but no row of numbers.
+    A block without known cells is not kept. If all its cells have the lowest number, like most empty space of a room,
+    it is bare: it has coordinates, but no row of numbers.
 
     values: (rows, 512) stored numbers, of which the first `count[0]` are in use.
-    coords: (rows + bare, 3) int32 block coordinates: those of the rows, and from `len(values)` on the bare ones.
-    count: (2,) int64, how many of both are in use.
+    coords: (rows + bare, 3) int32 block coordinates: rows first, and from `len(values)` on the bare ones.
+    count: (2,) int64, rows and bare blocks in use.
     table: the hash from block coordinates to places in `coords`.
-    rows, bare: for how many there is room at the start; the pool never shrinks below that.
+    rows, bare: initial capacity; the pool never shrinks below it.
     """
 
     def __init__(self, rules: CellRules, rows: int = 256, bare: int = 256):
@@ -50,7 +50,7 @@ class CellPool:
 
     @property
     def unknown(self) -> int:
-        """What a cell without evidence holds."""
+        """Value of a cell without evidence."""
         return self.rules.format.unknown
 
     @property
@@ -62,18 +62,18 @@ class CellPool:
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes of all arrays, in use or not; of what was never used, the system need not have given any."""
+        """Bytes of all arrays, in use or not; the system need not have provided memory never used."""
         return self.values.nbytes + self.coords.nbytes + self.table.nbytes
 
     @property
     def stored_cells(self) -> StoredCells:
-        """What kernels that only read need; holds until the pool changes."""
+        """The pool for read-only kernels; valid until the pool changes."""
         unknown = np.int32(self.rules.format.unknown)
         return StoredCells(self.table, self.coords, self.values, unknown, self.rules.lowest)
 
     @property
     def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.integer], NDArray[np.int64]]:
-        """The pool as kernels that change it take it; what they add must have room."""
+        """The pool for kernels that change it; room must be reserved first."""
         return self.table, self.coords, self.values, self.count
 
     @property
@@ -82,18 +82,18 @@ class CellPool:
         return self.coords[self._places()]
 
     def put(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; earlier content is lost."""
         kinds, places = np.empty(len(coords), np.uint8), np.empty(len(coords), np.int64)
         coords, cells = np.ascontiguousarray(coords, np.int32), np.ascontiguousarray(cells)
         _pool.needs(cells, self._limits[0], self._limits[2], kinds)
-        _pool.find_all(self.table, self.coords, coords, places)  # a block that is there keeps its room
+        _pool.find_all(self.table, self.coords, coords, places)  # an existing block keeps its room
         new_row, new_bare = (places < 0) | (places >= len(self.values)), places < len(self.values)
         self._reserve(int(((kinds == _pool.ROW) & new_row).sum()), int(((kinds == _pool.BARE) & new_bare).sum()))
         _pool.put(*self.arrays, coords, cells, kinds)
         self._shrink()
 
     def get(self, coords: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return those of the blocks (n, 3) that are there, and their cells (n, 512) as stored."""
+        """Return the existing ones of the blocks (n, 3), and their cells (n, 512) as stored."""
         places = np.empty(len(coords), np.int64)
         _pool.find_all(self.table, self.coords, coords, places)
         return coords[places >= 0], self._cells_at(places[places >= 0], self.values)
@@ -108,14 +108,14 @@ class CellPool:
         return coords[inside], self._cells_at(places[inside], self.values)
 
     def remove(self, coords: NDArray[np.int32]) -> None:
-        """Forget blocks (n, 3), each there or not."""
+        """Remove blocks (n, 3), whether present or not."""
         _pool.remove(*self.arrays, coords)
         self._shrink()
 
     def pieces(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
         """Yield coordinates (n, 3) and cells (n, 512) of all blocks in ascending order, at least once.
 
-        Of blocks that are made meanwhile nothing is yielded, others are as they are at their time.
+        Blocks created meanwhile are not yielded; others are as they are when yielded.
         """
         coords = self.block_coords
         coords = coords[np.lexsort(coords.T[::-1])]
@@ -132,7 +132,7 @@ class CellPool:
     ) -> int:
         """Add `values` (n, 512) to blocks `coords` (n, 3), and `steps` (m,) to the cells of `uniform` (m, 3).
 
-        In differences of stored numbers; no block is named twice. Returns the number of cells that changed.
+        Evidence is in differences of stored numbers; no block is named twice. Returns the number of cells that changed.
         """
         rows = self._rows_for(coords, values, uniform)
         floored, changed = np.zeros(len(rows), np.uint8), []
@@ -143,7 +143,7 @@ class CellPool:
 
         in_shards(one_shard, shards(len(rows), min(threads, len(rows) // WORTH_A_THREAD or 1)))
         sunk = int(np.count_nonzero(floored))
-        if sunk or not self._has_settled:  # the first time in any case: its kernel is compiled with the others
+        if sunk or not self._has_settled:  # the first time always, so that its kernel is compiled with the others
             self._settle(sunk, coords, uniform, floored)
             self._has_settled = True
         return sum(changed)
@@ -151,14 +151,14 @@ class CellPool:
     def needed_for(
         self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
     ) -> tuple[int, int]:
-        """Return the most rows and bare blocks that are in use while this evidence is added; it changes nothing."""
+        """Return the most rows and bare blocks in use while this evidence is added; changes nothing."""
         rows = np.empty(len(coords) + len(uniform), np.int32)
         made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
         has, bare = self.count.tolist()
         return has + made, bare + int(np.count_nonzero(rows != _add.SKIP))
 
     def needed_by(self, cells: NDArray[np.integer]) -> tuple[int, int]:
-        """Return how many rows and bare blocks are in use when blocks of `cells` (n, 512) have come on top."""
+        """Return the rows and bare blocks in use after blocks of `cells` (n, 512) are added."""
         kinds = np.empty(len(cells), np.uint8)
         _pool.needs(np.ascontiguousarray(cells), self._limits[0], self._limits[2], kinds)
         has, bare = self.count.tolist()
@@ -167,7 +167,7 @@ class CellPool:
     def _rows_for(
         self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
     ) -> NDArray[np.int32]:
-        """Return the rows (n + m,) that evidence goes to, made where there was none; below 0 where it says nothing."""
+        """Return the rows (n + m,) that evidence goes to, created if missing; below 0 if it says nothing."""
         n, (unknown, _, lowest, _) = len(coords), self._limits
         rows = np.empty(n + len(uniform), np.int32)
         made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
@@ -180,7 +180,7 @@ class CellPool:
     def _settle(
         self, sunk: int, coords: NDArray[np.int32], uniform: NDArray[np.int32], floored: NDArray[np.uint8]
     ) -> None:
-        """Take the rows from as many blocks as have `sunk` to the floor, marked in `floored` (n + m,)."""
+        """Remove the rows of the `sunk` blocks at the floor value, marked in `floored` (n + m,)."""
         n, (unknown, _, lowest, _) = len(coords), self._limits
         self._reserve(0, sunk)
         for blocks, theirs in ((coords, floored[:n]), (uniform, floored[n:])):
@@ -201,14 +201,14 @@ class CellPool:
         return len(self.values), len(self.coords) - len(self.values)
 
     def _reserve(self, rows: int, bare: int) -> None:
-        """Make room for so many more; rows keep their place."""
+        """Make room for this many more; rows keep their place."""
         used, room = self.count.tolist(), self._room()
         needed = used[0] + rows, used[1] + bare
         if needed[0] > room[0] or needed[1] > room[1]:
             self._resize(*(max(n, int(GROWTH * has)) if n > has else has for n, has in zip(needed, room, strict=True)))
 
     def _shrink(self) -> None:
-        """Give back room that is far from being used."""
+        """Release room that is far from being used."""
         used = self.count.tolist()
         if any(has > max(SPARE * n, least) for has, n, least in zip(self._room(), used, self._least, strict=True)):
             self._resize(*(max(int(GROWTH * n), least) for n, least in zip(used, self._least, strict=True)))

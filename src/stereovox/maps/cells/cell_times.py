@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times of cells: when each got its last evidence, and which cells are to be forgotten."""
+"""Times of cells: when each got its last evidence, and which cells have expired."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from stereovox.maps.storage.blocks import CELLS, BlockPool
 UNIT_NS = 10_000_000
 """Times are kept in steps of 10 ms."""
 FIRST, LAST = 1 << 30, (1 << 32) - 1
-"""The number of the time of the map's first frame; the largest there is. 124 days before and 373 days after the first
-frame can be stored; what lies farther off counts as just so far."""
+"""The stored time of the map's first frame, and the largest one. Times from 124 days before to 373 days after the first
+frame can be stored; others are clamped to that range."""
 NEVER = int(_times.NEVER)
 LATE = 8
 """A cell is forgotten at most `forget_s` / LATE after its time is over."""
 
 
 class CellTimes:
-    """Times of cells in a pool of their own, which knows blocks by their coordinates as `CellPool` does.
+    """Times of cells in their own pool, indexed by block coordinates like `CellPool`.
 
-    A time has a meaning only where the cell is known. start_ns: stamp of the first frame, None before it.
+    A time is valid only if the cell is known. start_ns: stamp of the first frame, None before it.
     """
 
     def __init__(self, config: MapConfig, capacity: int = 256):
         self.start_ns: int | None = None
         self._forget_ns = None if config.forget_s is None else max(ceil(config.forget_s * 1e9), LATE * _times.SLOTS)
         self._blocks = BlockPool(np.uint32, capacity)
-        self._has_written = self._has_forgotten = False  # at first all kernels are called, lest they compile later
+        self._has_written = self._has_forgotten = False  # at first all kernels are called, so that none compiles later
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -52,21 +52,21 @@ class CellTimes:
 
     @property
     def late_ns(self) -> float:
-        """How much longer than `forget_s` a cell may stay; infinite if none is forgotten."""
+        """How much longer than `forget_s` a cell may remain; infinite if none is forgotten."""
         return inf if self._forget_ns is None else self._forget_ns / LATE
 
     def steps(self, stamp_ns: int) -> np.uint32:
-        """Return the number that is kept for a time in nanoseconds."""
+        """Return the stored number for a time in nanoseconds."""
         start_ns = stamp_ns if self.start_ns is None else self.start_ns
         return np.uint32(min(max((stamp_ns - start_ns) // UNIT_NS + FIRST, NEVER + 1), LAST))
 
     def missing(self, evidence: Evidence) -> int:
-        """Return how many blocks `write` would make."""
+        """Return how many blocks `write` would create."""
         blocks = self._blocks
         return _times.missing(blocks.table, blocks.coords, evidence.coords, evidence.values, evidence.uniform)
 
     def write(self, evidence: Evidence, stamp_ns: int) -> None:
-        """Remember when cells got evidence; that of the first frame is where times count from."""
+        """Record when cells got evidence; times count from the first frame."""
         if self.start_ns is None:
             self.start_ns = stamp_ns
         blocks, first, self._has_written = self._blocks, not self._has_written, True
@@ -92,22 +92,22 @@ class CellTimes:
         blocks.values[places] = times[timed]
 
     def remove(self, coords: NDArray[np.int32]) -> None:
-        """Forget the times of blocks (n, 3), each there or not."""
+        """Remove the times of blocks (n, 3), whether present or not."""
         _times.remove(*self._arrays, np.ascontiguousarray(coords, np.int32))
 
     def follow(self, cells: CellPool, low: NDArray[np.int32], high: NDArray[np.int32]) -> None:
-        """Forget the times of blocks that touch cells [low, high) and of which `cells` knows nothing any more."""
+        """Remove the times of blocks that touch cells [low, high) and are no longer in `cells`."""
         _times.follow(*self._arrays, cells.table, cells.coords, low, high)
 
     def seconds_ago(self, times: NDArray[np.uint32], now_ns: int) -> NDArray[np.float32]:
-        """Return how long ago times are, in seconds; negative where they are later than now, NaN for NEVER."""
+        """Return the ages of times, in seconds; negative if later than now, NaN for NEVER."""
         since = (int(self.steps(now_ns)) - times.astype(np.int64)) * (UNIT_NS / 1e9)
         return np.where(times == NEVER, np.nan, since).astype(np.float32)
 
     def forget(self, cells: CellPool, before_ns: int, now_ns: int) -> None:
-        """Make cells unknown that had no evidence for `forget_s`, in the blocks whose turn came since `before_ns`.
+        """Make cells unknown that had no evidence for `forget_s`, in the blocks whose turn was since `before_ns`.
 
-        Each block has one turn in every eighth of `forget_s` by the clock of the stamps, whatever frames there were.
+        Each block has one turn in every eighth of `forget_s` by the stamps' clock, regardless of the frames.
         """
         if self._forget_ns is None:
             return
@@ -118,7 +118,7 @@ class CellTimes:
             self._forget_in_turns((before + 1) % _times.SLOTS, max(0, min(now - before, _times.SLOTS)), cells, now_ns)
 
     def expired(self, times: NDArray[np.integer], now_ns: int) -> NDArray[np.bool_]:
-        """Tell which times are over: more than `forget_s` before now, or after it, as where a clock was reset."""
+        """Return which times expired: more than `forget_s` before now, or after it, as when a clock was reset."""
         if self._forget_ns is None:
             return np.zeros(times.shape, bool)
         away = np.abs(times.astype(np.int64) - int(self.steps(now_ns)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence of one frame or scan: integrators make it, a map adds it."""
+"""Evidence of one frame or scan, made by integrators and added to a map."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ CELLS = SIDE * SIDE
 
 @dataclass(frozen=True, eq=False)
 class GridEvidence:
-    """Log-odds of one scan in thousandths, tile by tile; no tile stands in it twice.
+    """Log-odds of one scan in thousandths, tile by tile; each tile occurs once.
 
     coords: (n, 3) int32 tile coordinates x, y, 0: tile (0, 0) holds cells 0..63 on both axes.
-    values: (n, 4096) int16 or int32; cell (column, row) of a tile stands at `64 row + column`. Zero where the scan says
+    values: (n, 4096) int16 or int32; cell (column, row) of a tile is at `64 row + column`. Zero if the scan says
         nothing.
     """
 
@@ -31,7 +31,7 @@ class GridEvidence:
         return cls(np.empty((0, 3), np.int32), np.empty((0, CELLS), np.int16))
 
     def cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the cells it says something about: column and row (N, 2) in ascending order, thousandths (N,)."""
+        """Return the cells with evidence: column and row (N, 2) in ascending order, thousandths (N,)."""
         tile, place = np.nonzero(self.values)
         indices = self.coords[tile, :2].astype(np.int64) * SIDE + np.column_stack([place % SIDE, place // SIDE])
         order = np.lexsort(indices.T[::-1])
@@ -39,7 +39,7 @@ class GridEvidence:
 
 
 LOG_ODDS_SCALE = 1000
-"""Log-odds are kept as whole thousandths; zero means "nothing is known"."""
+"""Log-odds are kept as whole thousandths; zero means "unknown"."""
 LARGEST = 32767
 
 
@@ -50,11 +50,11 @@ def to_units(log_odds: float | NDArray[np.floating]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Log-odds of one frame in thousandths, block by block; no block stands in it twice.
+    """Log-odds of one frame in thousandths, block by block; each block occurs once.
 
-    coords: (n, 3) int32 block coordinates; values: (n, 512) int16, zero where the frame says nothing.
-    uniform: (m, 3) int32 wholly free blocks; uniform_values: (m,) int16, negative, what all cells of each get; one
-        number serves all.
+    coords: (n, 3) int32 block coordinates; values: (n, 512) int16, zero if the frame says nothing.
+    uniform: (m, 3) int32 wholly free blocks; uniform_values: (m,) int16, negative, the evidence for every cell of each
+        block.
     """
 
     coords: NDArray[np.int32]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pyramid of a map in boxes: levels of cells twice as large, so that the whole of a big map can be seen.
+"""The pyramid of a map in boxes: levels of cells twice as large, so that all of a big map can be shown.
 
-A coarse cell has the worst state of its eight parts, as in `products.coarsen`: it is free only where all of them are.
+A coarse cell has the worst state of its eight parts, as in `products.coarsen`: it is free only if all of them are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.storage.boxes import BoxBlocks, BoxEntry, BoxLayout, Index, read_box, write_blocks
 
 SMALL = 100_000
-"""The pyramid ends with a level of no more known cells, or of one box."""
+"""The pyramid ends with a level of at most this many known cells, or of one box."""
 HALF = SIDE // 2
 PIECE = 4096
 """Blocks that are coarsened at once."""
@@ -32,7 +32,7 @@ def coarser_config(config: Config, factor: int) -> Config:
 
 
 def coarser_layout(layout: BoxLayout) -> BoxLayout:
-    """Return how the next level is cut: boxes of as many cells, each twice as long; times are not kept there."""
+    """Return the layout of the next level: boxes of as many cells, each twice as long; without times."""
     config = coarser_config(layout.config, 2)
     config = load_config(config, map=config.map.model_copy(update={"keep_times": False, "forget_s": None}).model_dump())
     return BoxLayout(config, layout.side, layout.level + 1)
@@ -45,7 +45,7 @@ def parent_of(index: Sequence[int]) -> Index:
 
 
 def families(entries: Iterable[BoxEntry]) -> dict[Index, list[BoxEntry]]:
-    """Return the boxes of a level by the box of the next one that covers them: what `write_parent` takes."""
+    """Return the boxes of a level grouped by the next level's box that covers them, for `write_parent`."""
     found: dict[Index, list[BoxEntry]] = defaultdict(list)
     for entry in entries:
         found[parent_of(entry.box)].append(entry)
@@ -53,12 +53,12 @@ def families(entries: Iterable[BoxEntry]) -> dict[Index, list[BoxEntry]]:
 
 
 def names_of(family: Iterable[BoxEntry]) -> frozenset[str]:
-    """Return what stands for the content of a family: boxes are named after theirs."""
+    """Return the names of a family, which identify its content: boxes are named after theirs."""
     return frozenset(entry.name for entry in family)
 
 
 def write_parent(place: Place, layout: BoxLayout, children: Sequence[BoxEntry]) -> BoxEntry | None:
-    """Write the box of the next level that covers `children`, all boxes of one family; return its entry.
+    """Write the next level's box that covers `children`, all boxes of one family; return its entry.
 
     layout: of the children. None if no coarse cell is known. Raises MapFileError as `read_box` and `write_box` do.
     """
@@ -68,7 +68,7 @@ def write_parent(place: Place, layout: BoxLayout, children: Sequence[BoxEntry]) 
 
 
 def _joined(parts: Sequence[tuple[NDArray[np.int32], NDArray[np.integer]]], unknown: int) -> BoxBlocks:
-    """Return the blocks of all parts in order; boxes of an odd number of blocks have some in common, but no cell."""
+    """Return the blocks of all parts in order; boxes of an odd number of blocks share blocks, but no cells."""
     coords, of_block = np.unique(np.concatenate([coords for coords, _ in parts]), axis=0, return_inverse=True)
     cells = np.full((len(coords), CELLS), unknown, parts[0][1].dtype)
     ends = np.cumsum([len(own) for own, _ in parts])
@@ -78,7 +78,7 @@ def _joined(parts: Sequence[tuple[NDArray[np.int32], NDArray[np.integer]]], unkn
 
 
 def write_levels(place: Place, layout: BoxLayout, entries: Sequence[BoxEntry]) -> list[list[BoxEntry]]:
-    """Write all coarser levels of these boxes, one after the other; return their entries, for a manifest."""
+    """Write all coarser levels of these boxes in order; return their entries, for a manifest."""
     levels: list[list[BoxEntry]] = []
     while not is_top(entries):
         parents = (write_parent(place, layout, family) for family in families(entries).values())
@@ -88,14 +88,14 @@ def write_levels(place: Place, layout: BoxLayout, entries: Sequence[BoxEntry]) -
 
 
 def is_top(entries: Sequence[BoxEntry]) -> bool:
-    """Tell whether a level needs none above it: it is small, or one box."""
+    """Return whether a level needs none above it: it is small, or one box."""
     return len(entries) <= 1 or sum(entry.known for entry in entries) <= SMALL
 
 
 def halved(
     rules: CellRules, coords: NDArray[np.int32], cells: NDArray[np.integer]
 ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-    """Return the blocks (m, 3) of cells twice as large, and these (m, 512), of blocks (n, 3) with cells (n, 512)."""
+    """Return the blocks (m, 3) and cells (m, 512), twice as large, that cover blocks (n, 3) with cells (n, 512)."""
     above, of_block = np.unique(coords >> 1, axis=0, return_inverse=True)
     coarse = np.full((len(above), SIDE, SIDE, SIDE), rules.format.unknown, rules.format.dtype)
     octants = coarse.reshape(-1, 2, HALF, 2, HALF, 2, HALF)

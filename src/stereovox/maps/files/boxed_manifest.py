@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest of a map in boxes: which boxes it has, the coarser levels of its pyramid, and how it was made.
+"""The manifest of a map in boxes: its boxes, the coarser levels of its pyramid, and how it was made.
 
-It is written last and replaced whole, so that whoever reads sees the older map or the newer one. Boxes that no manifest
-names belong to writers that were killed, or to older maps; the next writer sweeps them.
+It is written last and replaced as a whole, so readers see either the older or the newer map. Boxes that no manifest
+names belong to killed writers or to older maps; the next writer sweeps them.
 """
 
 from __future__ import annotations
@@ -28,23 +28,22 @@ from stereovox.maps.record.history import History
 from stereovox.maps.storage.boxes import BOXES, BoxEntry, BoxLayout
 
 VERSION = 5
-"""Of the manifest; that of maps in one piece is another."""
+"""Version of this manifest; maps in one piece have another."""
 MAX_MANIFEST = 1 << 27
-"""Bytes of a manifest; a box takes about 300."""
+"""Largest size of a manifest in bytes; a box takes about 300."""
 MAX_LEVELS = 24
 LOCK = ".writer"
-"""The object that stands for the right to write to a place in a store, and names who has it."""
+"""The lock object for writing to a place in a store; it names its holder."""
 MAX_HOLDER = 1000
 
 
 @dataclass
 class BoxedManifest:
-    """What the manifest of a map in boxes says.
+    """The manifest of a map in boxes.
 
-    layout: settings and side of a box. boxes: those of the map. levels: those of coarser levels, each of half as many
-    cells along an axis as the one before; may be empty. history: what the map remembers of its frames. viewpoint: where
-    the camera stood last. times_start_ns: from when times of cells count. extra: plain values for JSON that whoever
-    makes maps keeps with them.
+    layout: settings and side of a box. boxes: those of the map. levels: those of coarser levels, each with half as many
+    cells along an axis as the one before; may be empty. history: the map's record of its frames. viewpoint: the last
+    camera pose. times_start_ns: origin of cell times. extra: plain JSON values that the map's maker keeps with it.
     """
 
     layout: BoxLayout
@@ -56,7 +55,7 @@ class BoxedManifest:
     extra: dict[str, Any] = field(default_factory=dict)
 
     def layout_of(self, level: int) -> BoxLayout:
-        """Return how a level is cut; 0 is the map itself."""
+        """Return the layout of a level; 0 is the map itself."""
         layout = self.layout
         for _ in range(level):
             layout = coarser_layout(layout)
@@ -64,15 +63,15 @@ class BoxedManifest:
 
     @property
     def names(self) -> set[str]:
-        """Names of all boxes, those of the levels with them."""
+        """Names of all boxes, including the levels'."""
         return {entry.name for level in (self.boxes, *self.levels) for entry in level}
 
 
 def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
-    """Make boxes that are in a place its map; an older one there is replaced at once.
+    """Publish the boxes in a place as its map, replacing an older one atomically.
 
-    Raises MapFileError if it cannot be written, or has so many boxes that it could not be read; the older map is
-    then as it was.
+    Raises MapFileError if it cannot be written, or has too many boxes to be readable; the older map is then
+    unchanged.
     """
     layout = manifest.layout
     saved = {
@@ -94,7 +93,7 @@ def write_boxed_manifest(place: Place, manifest: BoxedManifest) -> None:
 
 
 def read_boxed_manifest(place: Place) -> BoxedManifest:
-    """Read what `write_boxed_manifest` wrote. Raises MapFileError: one line with the place and what is wrong."""
+    """Read a manifest. Raises MapFileError: one line with the place and what is wrong."""
     data = place.find(MANIFEST, MAX_MANIFEST)
     if data is None:
         raise MapFileError(f"{place}: no stereovox map here (no {MANIFEST}); check the name")
@@ -102,13 +101,13 @@ def read_boxed_manifest(place: Place) -> BoxedManifest:
     try:
         return _manifest_of(saved)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise MapFileError(f"{place}: damaged map ({type(error).__name__}: {error}); make it anew") from None
+        raise MapFileError(f"{place}: damaged map ({type(error).__name__}: {error}); make it again") from None
 
 
 def sweep_boxes(place: Place, keep: Iterable[str] = ()) -> None:
-    """Remove the boxes that neither the manifest nor `keep` names. No one else may be writing here.
+    """Remove the boxes that neither the manifest nor `keep` names. Nobody else may be writing here.
 
-    keep: names of boxes (`BoxEntry.name`) that a manifest still to be written will name.
+    keep: names of boxes (`BoxEntry.name`) that a later manifest will name.
     """
     place.tidy()
     named = set(keep)
@@ -118,7 +117,7 @@ def sweep_boxes(place: Place, keep: Iterable[str] = ()) -> None:
             unnamed = [file for file in place.names(f"{BOXES}/") if "/".join(file.split("/")[:3]) not in named]
             place.remove(unnamed)
             return
-    if not place.names(MANIFEST):  # a damaged map stays as it is
+    if not place.names(MANIFEST):  # a damaged map is left alone
         place.remove([file for file in place.names(f"{BOXES}/") if "/".join(file.split("/")[:3]) not in named])
 
 
@@ -126,8 +125,8 @@ def sweep_boxes(place: Place, keep: Iterable[str] = ()) -> None:
 def only_writer_at(place: Place) -> Iterator[None]:
     """Hold the right to write to a place. Raises MapFileError if another run has it.
 
-    A folder's is lifted by the system however its holder ends. A store knows no such thing: what a run leaves there
-    that `kill -9` ended must be removed by hand, as the error says, which names that run.
+    The system releases a folder's lock however its holder ends. A store cannot: the lock of a run that `kill -9` ended
+    must be removed by hand, as the error says, which names that run.
     """
     if isinstance(place, Folder):
         with only_writer_in(place.path):
@@ -167,5 +166,5 @@ def _entries(saved: Sequence[dict[str, Any]], layout: BoxLayout) -> list[BoxEntr
 
 
 def bounds_of(entries: Sequence[BoxEntry]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest known cell (3,) of boxes, and the first beyond the highest."""
+    """Return the lowest known cell (3,) of boxes, and the first cell beyond the highest."""
     return np.min([entry.low for entry in entries], axis=0), np.max([entry.high for entry in entries], axis=0)

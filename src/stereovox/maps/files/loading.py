@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens saved maps: those in one piece are read, those in boxes are opened to be read where they are asked about."""
+"""Opens saved maps: maps in one piece are read, maps in boxes are opened and read on demand."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from stereovox.maps.voxel_map import VoxelMap
 
 
 def load_map(path: str | Path, *, cache_bytes: int = CACHE_BYTES) -> VoxelMap:
-    """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in; or open a map in boxes.
+    """Read a whole map saved by `VoxelMap.save`, whatever window it was made in; or open a map in boxes.
 
-    A map in boxes (`save_boxed`) is not loaded: each question reads the boxes it needs.
+    A map in boxes (`save_boxed`) is not loaded: each query reads the boxes it needs.
 
     Args:
         path: The folder of the map, or its URL in an object store (`s3://bucket/city.svox`).
-        cache_bytes: Memory for the cells of a map in boxes; others take what they need.
+        cache_bytes: Memory for the cells of a map in boxes; other maps take what they need.
 
     Returns:
         The map, without bounds, in memory; or a `BoxedMap`.

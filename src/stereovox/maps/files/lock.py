@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One writer at a time: a lock on a file that the system lifts when its holder ends, however it ends.
+"""One writer at a time: a file lock that the system releases however its holder ends.
 
-Readers need no lock. The file is left behind by a process that is killed, which does no harm.
+Readers need no lock. A killed process leaves the file behind, which does no harm.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from stereovox.files.safe_io import FLOOR_ENDINGS, sweep_unfinished, sync_folder
 LOCK = ".lock"
 """The lock file in a folder that is being written."""
 PATIENCE_S = 0.1
-"""How long a writer waits for another: just long enough for one that is about to end."""
+"""Time a writer waits for another: just enough for one that is about to end."""
 
 
 @contextmanager
 def only_writer_in(folder: Path) -> Iterator[None]:
-    """Hold the right to write to `folder`, which is made, and is removed at the end if it is empty then.
+    """Hold the right to write to `folder`; it is created, and removed at the end if empty.
 
-    Within one thread this may be entered again. Raises MapFileError if another process or thread is the writer and
-    where the folder cannot be written.
+    Re-entrant within one thread. Raises MapFileError if another process or thread is the writer, or
+    if the folder cannot be written.
     """
     with _made(folder), _held(folder, folder / LOCK, again=True):
         yield
@@ -33,16 +33,16 @@ def only_writer_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def only_store_in(folder: Path) -> Iterator[None]:
-    """Hold the right to write to `folder` for one object: as `only_writer_in`, but it cannot be entered again."""
+    """Hold the right to write to `folder` for one object: as `only_writer_in`, but not re-entrant."""
     with _made(folder), _held(folder, folder / LOCK, again=False):
         yield
 
 
 @contextmanager
 def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
-    """Hold the right to write `file`, and `others` with it: as `only_writer_in`; the lock stands next to it.
+    """Hold the right to write `file`, and `others` with it: as `only_writer_in`; the lock is next to it.
 
-    What a writer left of them that was killed is removed.
+    Remains of a killed writer are removed.
     """
     with _held(file, file.with_name(f".{file.name}{LOCK}"), again=True):
         sweep_unfinished(file, *others)
@@ -50,7 +50,7 @@ def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
 
 
 def only_writer_of_floor(out: Path) -> AbstractContextManager[None]:
-    """Hold the right to write a floor's map, its pictures and its trajectory, whichever of them `out` names."""
+    """Hold the right to write a floor's map, its pictures and its trajectory, whichever of these `out` names."""
     yaml, *pictures, way = (out.with_suffix(ending) for ending in (*FLOOR_ENDINGS, ".tum"))
     between = [picture.with_name(f".{picture.name}") for picture in pictures]
     return only_writer_of(yaml, *pictures, *between, way)
@@ -75,7 +75,7 @@ def _made(folder: Path) -> Iterator[None]:
 def _held(what: Path, where: Path, again: bool) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
-    where = Path(os.path.realpath(where.parent)) / where.name  # by any name it is the same lock
+    where = Path(os.path.realpath(where.parent)) / where.name  # the same lock by any name
     with _one_line_errors(what):
         os.stat(where.parent)  # filelock would make the folder
         lock = FileLock(where, is_singleton=again, thread_local=again)
@@ -96,7 +96,7 @@ def _held(what: Path, where: Path, again: bool) -> Iterator[None]:
 
 @contextmanager
 def _one_line_errors(what: Path) -> Iterator[None]:
-    """Turn errors of the system into a MapFileError of one line."""
+    """Turn system errors into a one-line MapFileError."""
     try:
         yield
     except (OSError, NotImplementedError) as error:

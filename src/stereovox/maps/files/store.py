@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map on disk: a folder with a manifest (JSON) and the cells as Zarr v3 arrays.
 
-Zarr writes are not transactional, so each save goes to a folder of its own and becomes the map when the manifest
-that names it is renamed into place; only then is the older save removed. Each step waits until the disk has it: a save
-that is killed, or that a power cut ends, leaves the older map whole. The next save removes what it left.
+Zarr writes are not transactional, so each save goes to a new folder and becomes the map when the manifest that names it
+is renamed into place; only then is the older save removed. Each step waits until the data is on disk: a save that is
+killed, or ended by a power cut, leaves the older map intact. The next save removes its remains.
 
-Arrays are read as they are written here and in no other form. Zarr would follow whatever a stranger's folder says: any
-packing, any shape, arrays of arrays, links to elsewhere. So all of it is checked before Zarr sees the folder, and
-nothing is allocated for what is not there.
+Arrays are read only in the exact form written here. Zarr would follow whatever a stranger's folder states: any packing,
+any shape, arrays of arrays, links to elsewhere. So everything is checked before Zarr sees the folder, and nothing is
+allocated for missing data.
 """
 
 from __future__ import annotations
@@ -54,28 +54,28 @@ from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.storage.storage import Storage
 
 ARRAYS = ("coords", "cells", "times")
-"""Names of the arrays of a map, the last only where times are kept."""
+"""Names of the arrays of a map, the last only if times are kept."""
 MAX_CHUNK = 1 << 26
-"""Bytes of an unpacked chunk; `store` writes 4 MiB."""
+"""Largest size of an unpacked chunk in bytes; `store` writes 4 MiB."""
 SMALL, PACKED_BEST = 1 << 24, 100
-"""Coordinates may unpack to so many bytes, or to so many for each of theirs on disk."""
+"""Coordinates may unpack to this many bytes, or to this many times their bytes on disk."""
 BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian": "little"}}
 FORMAT = "stereovox-map"
 VERSION = 4
 MANIFEST = "manifest.json"
 BOXED = b'"format": "stereovox-map", "version": 5,'
-"""Begins the manifest of a map in boxes."""
+"""Start of the manifest of a map in boxes."""
 MAX_MANIFEST = 1 << 22
-"""Bytes of a manifest."""
+"""Largest size of a manifest in bytes."""
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(rf"cells-[0-9a-f]{{12}}|{FRAME_FILES}|\.manifest\.json\.new|\.lock")
-"""Names of what a killed save leaves."""
+"""Names of files that a killed save leaves."""
 Slab = tuple[NDArray, ...]
-"""Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
+"""Block coordinates (n, 3), cells (n, 512), and times (n, 512) if they are kept."""
 
 
 class SavedMap(NamedTuple):
-    """What a saved map holds; `times` is None if none were kept, `kept` if its frames were not."""
+    """The content of a saved map; `times` is None if none were kept, `kept` if frames were not."""
 
     config: Config
     history: History
@@ -89,10 +89,10 @@ class SavedMap(NamedTuple):
 
 
 def save_map(storage: Storage, path: str | Path) -> None:
-    """Write a map to the folder `path`, so that the disk holds all of it when this returns.
+    """Write a map to the folder `path`; all of it is on disk when this returns.
 
-    Raises MapFileError when it cannot be written, is no map, or is being written by another run; an older map is then
-    as it was.
+    Raises MapFileError if it cannot be written, is not a map, or is being written by another run; an older map is then
+    unchanged.
     """
     folder = Path(path)
     check_target(folder)
@@ -106,7 +106,7 @@ def save_map(storage: Storage, path: str | Path) -> None:
             _write_manifest(folder, {**_manifest(storage, data, blocks, checksum), "kept_frames": frames})
         except BaseException as error:
             _let_writes_end()
-            if data not in _named(folder):  # else it is the map already, whatever the disk says
+            if data not in _named(folder):  # else it is already the map, whatever the disk says
                 sweep(folder)
             if not isinstance(error, OSError):
                 raise
@@ -119,7 +119,7 @@ def save_map(storage: Storage, path: str | Path) -> None:
 
 
 def remove_map(folder: Path) -> None:
-    """Remove a saved map from its folder, which stays. Raises MapFileError if another run writes it."""
+    """Remove a saved map from its folder, which remains. Raises MapFileError if another run writes it."""
     with only_writer_in(folder):
         with suppress(OSError):
             (folder / MANIFEST).unlink(missing_ok=True)
@@ -127,14 +127,14 @@ def remove_map(folder: Path) -> None:
 
 
 def check_target(folder: Path) -> None:
-    """Raise MapFileError when a map cannot be saved to `folder`: it holds something else or cannot be written."""
+    """Raise MapFileError if a map cannot be saved to `folder`: it holds something else or is not writable."""
     if "\0" in str(folder):
         raise MapFileError(f"{str(folder)!r}: no file name holds the character 0; choose another name")
-    if is_url(url := str(folder).replace(":/", "://", 1)):  # a path has one slash where a URL has two
+    if is_url(url := str(folder).replace(":/", "://", 1)):  # a path has one slash instead of two
         raise MapFileError(f"{url}: only a map in boxes can lie in an object store (fleet, save_boxed); name a folder")
     try:
         there = folder.exists()
-    except OSError as error:  # a name that is too long, a folder that may not be entered
+    except OSError as error:  # the name is too long, or the folder may not be entered
         raise MapFileError(f"{folder}: cannot be written ({error.strerror}); choose another name") from None
     if there and not is_map(folder) and not _is_free(folder):
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
@@ -147,7 +147,7 @@ def check_target(folder: Path) -> None:
 
 
 def read_map(path: str | Path) -> SavedMap:
-    """Read what `save_map` wrote, all of it. Raises MapFileError: one line with the file and what is wrong."""
+    """Read a whole map written by `save_map`. Raises MapFileError: one line with the file and what is wrong."""
     folder = Path(path)
     manifest = read_manifest(folder)
     while True:
@@ -155,7 +155,7 @@ def read_map(path: str | Path) -> SavedMap:
             return _read(folder, manifest)
         except MapFileError:
             tried, manifest = manifest, read_manifest(folder)
-            if manifest.get("data") == tried.get("data"):  # else a newer save took its place meanwhile
+            if manifest.get("data") == tried.get("data"):  # else a newer save replaced it meanwhile
                 raise
 
 
@@ -173,20 +173,20 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
             raise ValueError("the cells do not match their checksum")
         kept = read_frames(folder, manifest["kept_frames"], config.map.frames_budget)
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
-        raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
+        raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it again") from None
     return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns, kept)
 
 
 def read_blocks(folder: Path, blocks: int, *dtypes: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
-    """Return coordinates (n, 3) int32 and what is kept of each cell (n, 512) of all blocks; no block is named twice.
+    """Return coordinates (n, 3) int32 and the cell arrays (n, 512) of all blocks; no block is named twice.
 
-    dtypes: those of the cells, and of their times where there are any. They are read last: their room is that of
-    coordinates which are really there.
-    Raises ValueError, one line, where the folder is not just what `store` writes, and OSError.
+    dtypes: of the cells, and of their times if any. They are read last: memory is allocated only for coordinates that
+    really exist.
+    Raises ValueError, one line, if the folder is not exactly what `store` writes, and OSError.
     """
     sizes = dict(_files(folder))
     if not 0 <= blocks * 3 * 4 <= max(SMALL, PACKED_BEST * sum(sizes.values())):
-        raise ValueError(f"{blocks} blocks where there are {sum(sizes.values())} bytes")
+        raise ValueError(f"{blocks} blocks in {sum(sizes.values())} bytes")
     coords = _read_array(folder, "coords", (blocks, 3), np.dtype(np.int32), sizes)
     _check_coords(coords)
     kept = zip(ARRAYS[1:], dtypes, strict=False)
@@ -194,7 +194,7 @@ def read_blocks(folder: Path, blocks: int, *dtypes: np.dtype[Any]) -> tuple[NDAr
 
 
 def _files(folder: Path) -> Iterator[tuple[str, int]]:
-    """Yield path below `folder` and bytes of all files; raises ValueError for links and what is no file."""
+    """Yield path below `folder` and bytes of all files; raises ValueError for anything but files."""
     if folder.is_symlink():
         raise ValueError(f"{folder.name} is a link")
     for above, folders, names in os.walk(folder):
@@ -203,7 +203,7 @@ def _files(folder: Path) -> Iterator[tuple[str, int]]:
             if name in names and stat.S_ISREG(status.st_mode):
                 yield os.path.relpath(os.path.join(above, name), folder), status.st_size
             elif not stat.S_ISDIR(status.st_mode):
-                raise ValueError(f"{name} is a link or no file")
+                raise ValueError(f"{name} is a link or not a file")
 
 
 def _read_array(
@@ -221,7 +221,7 @@ def _read_array(
 
 
 def _rows_per_chunk(header: Any, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> int:
-    """Return the rows of a chunk; raises ValueError for an array that `store` would not write."""
+    """Return the rows of a chunk; raises ValueError for an array that `store` does not write."""
     rows, width = header["chunk_grid"]["configuration"]["chunk_shape"]
     if header["shape"] != list(shape) or header["data_type"] != dtype.name:
         raise ValueError(f"array of {header['shape']} {header['data_type']} where {list(shape)} {dtype} belongs")
@@ -246,7 +246,7 @@ def _rows_per_chunk(header: Any, name: str, shape: tuple[int, int], dtype: np.dt
 
 
 def _check_chunk(path: Path, size: int, unpacked: int) -> None:
-    """Raise ValueError for a chunk that does not say that it unpacks to just so many bytes."""
+    """Raise ValueError for a chunk whose header does not give exactly this unpacked size."""
     with path.open("rb") as file:
         head = file.read(18)
     if zstd_size(head) != unpacked or size > 2 * unpacked + 64:
@@ -254,23 +254,23 @@ def _check_chunk(path: Path, size: int, unpacked: int) -> None:
 
 
 def _check_coords(coords: NDArray[np.int32]) -> None:
-    """Raise ValueError for a block that is named twice or lies farther away than cells can."""
+    """Raise ValueError for a block that is named twice or out of range."""
     if (np.abs(coords.astype(np.int64)) >= INDEX_LIMIT // SIDE).any():
-        raise ValueError("a block that lies too far away")
+        raise ValueError("a block is out of range")
     if _ascend(coords):
         return
     if not _ascend(coords[np.lexsort(coords.T[::-1])]):
-        raise ValueError("a block that is named twice")
+        raise ValueError("a block is named twice")
 
 
 def _ascend(coords: NDArray[np.int32]) -> bool:
-    """Tell whether each block stands behind the one before: by x, then y, then z."""
+    """Return whether blocks ascend: by x, then y, then z."""
     steps = np.sign(np.diff(coords.astype(np.int64), axis=0)) @ [4, 2, 1]
     return bool((steps > 0).all())
 
 
 def is_boxed(path: str | Path) -> bool:
-    """Tell whether a folder holds a map in boxes (`boxed_manifest`), by the beginning of its manifest."""
+    """Return whether a folder holds a map in boxes (`boxed_manifest`), by the start of its manifest."""
     try:
         with (Path(path) / MANIFEST).open("rb") as file:
             return BOXED in file.read(100)
@@ -279,9 +279,9 @@ def is_boxed(path: str | Path) -> bool:
 
 
 def is_map(path: str | Path) -> bool:
-    """Tell whether a folder, or a URL in an object store, where they are in boxes, holds a saved map.
+    """Return whether a folder holds a saved map, or a URL in an object store a map in boxes.
 
-    Raises MapFileError for a store out of reach.
+    Raises MapFileError if the store is unreachable.
     """
     if is_url(path):
         return MANIFEST in Place.of(path).sizes(MANIFEST)
@@ -317,10 +317,10 @@ def manifest_from(data: bytes, version: int, where: str) -> dict[str, Any]:
     except ValueError as error:
         why = error
     try:
-        _of_version(json_value(data), version, where)  # what is no manifest, or an older one, has no digest
+        _of_version(json_value(data), version, where)  # other files and older manifests have no digest
     except ValueError as error:
         why = error
-    raise MapFileError(f"{where}: damaged map ({why}); make it anew")
+    raise MapFileError(f"{where}: damaged map ({why}); make it again")
 
 
 def _of_version(manifest: Any, version: int, where: str) -> dict[str, Any]:
@@ -329,29 +329,29 @@ def _of_version(manifest: Any, version: int, where: str) -> dict[str, Any]:
     if manifest.get("version") != version:
         found = shown(manifest.get("version"))
         raise MapFileError(
-            f"{where}: map format {found}, this program reads {version}; make the map anew or update stereovox"
+            f"{where}: map format {found}, this program reads {version}; make the map again or update stereovox"
         )
     return manifest
 
 
 def _is_free(folder: Path) -> bool:
-    """Tell whether a folder holds nothing but what a killed save left."""
+    """Return whether a folder holds only remains of a killed save."""
     return folder.is_dir() and all(UNFINISHED.fullmatch(entry.name) for entry in folder.iterdir())
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed or failed saves left: all that the manifest does not name. The lock must be held."""
+    """Remove remains of killed or failed saves: all that the manifest does not name. The lock must be held."""
     named = _named(folder)
     if not named and is_map(folder):
-        return  # a damaged map stays as it is
-    with suppress(OSError):  # what cannot be removed does no harm
+        return  # a damaged map is left alone
+    with suppress(OSError):  # files that cannot be removed do no harm
         for entry in folder.iterdir():
             if UNFINISHED.fullmatch(entry.name) and entry.name not in {*named, LOCK}:
                 shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
 
 
 def _let_writes_end() -> None:
-    """Wait for what Zarr still writes: of several files at once, one that fails does not stop the others."""
+    """Wait for Zarr's pending writes: a failed file does not stop the others."""
     from zarr.core.sync import sync
 
     async def the_others() -> None:
@@ -384,7 +384,7 @@ def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> 
 
 
 def _checksums(arrays: Slab) -> list[int]:
-    """Return a number for each array. Zarr reads a chunk whose file is gone as empty cells; these tell."""
+    """Return a number for each array. Zarr reads a missing chunk as empty cells; these detect it."""
     return [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays]
 
 
@@ -401,7 +401,7 @@ def viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
 
 
 def viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
-    """Return a saved viewpoint. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+    """Return a saved viewpoint. Raises KeyError, TypeError or ValueError for invalid values."""
     if saved is None:
         return None
     numbers = dict(saved["camera"])
@@ -418,13 +418,13 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
         file.write(sealed(manifest, as_number, indent=2))
         file.flush()
         os.fsync(file.fileno())
-    sync_folder(folder)  # whatever the new manifest names is there before it
+    sync_folder(folder)  # all that the new manifest names is on disk before it
     temporary.replace(folder / MANIFEST)
     sync_folder(folder)
 
 
 def as_number(number: Any) -> Any:
-    """Return Python's own number for one of NumPy, which JSON does not know: `np.int64(5)` as a time, for example."""
+    """Return a NumPy number, which JSON cannot store, as Python's own: `np.int64(5)` as a time, for example."""
     if not isinstance(number, np.generic):
         raise TypeError(f"{type(number).__name__} cannot be saved")
     return number.item()
@@ -450,7 +450,7 @@ def _write_arrays(folder: Path, storage: Storage) -> tuple[int, list[int]]:
 
 
 def _whole_chunks(slabs: Iterable[Slab]) -> Iterator[Slab]:
-    """Yield the same blocks in pieces of whole chunks, the last one shorter: so no chunk is written twice."""
+    """Yield the blocks in pieces of whole chunks, the last one shorter, so that no chunk is written twice."""
     held: list[Slab] = []
     rows = 0
     for slab in slabs:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Questions about places, boxes and rays in a map."""
+"""Queries for points, boxes and rays in a map."""

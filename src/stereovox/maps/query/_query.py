@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all queries share: cells at points, states, rows asked for lately, and marks on the cells that matter."""
+"""Shared by all queries: cells at points, states, a cache of rows, and marks on relevant cells."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from stereovox.maps.cells._cells import EMPTY, NO_ROW, number_in, row_of
 
 LATELY = (4096, 4)
 NOWHERE = np.int32(2**30)
-"""No block has such a coordinate."""
+"""No block has this coordinate."""
 UNKNOWN, TENTATIVE = np.int32(_cells.UNKNOWN), np.int32(_cells.TENTATIVE)
 UNKNOWN_BIT = np.uint8(1 << _cells.UNKNOWN)
 BIT, ONE, NO_BITS = np.uint8(1), np.int32(1), np.uint64(0)
@@ -36,13 +36,13 @@ def look_up(stored, side, limit, points, out):
 
 @exact_cell
 def cells_from_zero(place, side):
-    """Return a place in cells; what falls onto a face does so for NumPy, too."""
+    """Return a place in cells, rounded as in NumPy at faces."""
     return np.float64(place) / side
 
 
 @cell
 def row_again(stored, lately, bx, by, bz):
-    """Return what `row_of` does, from memory where it can; of 16 x 16 x 16 neighbouring blocks none shuts out another.
+    """Do as `row_of`, from a cache if possible; 16 x 16 x 16 neighbouring blocks do not evict each other.
 
     lately: (4096, 4) int32 block coordinates and row, NOWHERE at first.
     """
@@ -63,11 +63,11 @@ def state_of(stored, rules, number):
 
 @cell
 def level_of(stored, rules, wanted, row, marks, levels):
-    """Return the highest level among the cells of a block, -1 if none is wanted; `row` is what `row_of` gave.
+    """Return the highest level among the cells of a block, -1 if none is wanted; `row` comes from `row_of`.
 
-    Cells of a row are marked when it is first asked for; without a row all cells of a block are of one level.
-    wanted: (n,) uint8, for each level the states that belong to it, bit by bit.
-    marks: (rows, n, 8) uint64, one word for each layer of x: bit 8 y + z. levels: (rows,) int8, 0 where not yet asked.
+    Cells of a row are marked on first use; without a row all cells of a block have one level.
+    wanted: (n,) uint8, for each level a bit set of its states.
+    marks: (rows, n, 8) uint64, one word for each layer of x: bit 8 y + z. levels: (rows,) int8, 0 if not yet used.
     """
     if row < 0:
         return _level(wanted, UNKNOWN if row == NO_ROW else state_of(stored, rules, stored.lowest))

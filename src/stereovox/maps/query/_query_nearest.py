@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that looks for the cell nearest to a point: in its block, then in shells of blocks about it."""
+"""Kernel that finds the cell nearest to a point: in its block, then in shells of blocks around it."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ ZERO, ONE, BYTE = np.uint64(0), np.uint64(1), np.uint64(255)
 
 @allocating_kernel
 def nearest(stored, rules, wanted, side, points, farthest, distance, cells):
-    """Write the distance from each of `points` (n, 3) to the nearest wanted cell, and which it is (n, 3).
+    """Write the distance from each of `points` (n, 3) to the nearest wanted cell, and the cell (n, 3).
 
-    wanted: (1,) uint8, bits of states. Leaves what has none as near as `farthest`.
+    wanted: (1,) uint8, bits of states. Points without one within `farthest` are left unchanged.
     """
     lately = np.full(LATELY, NOWHERE, np.int32)
     marks = np.empty((stored.values.shape[0], 1, 8), np.uint64)
@@ -31,8 +31,8 @@ def nearest(stored, rules, wanted, side, points, farthest, distance, cells):
 def _nearest(stored, rules, wanted, side, p, farthest, lately, marks, levels):
     """Return the squared distance of the nearest wanted cell, infinite if none is near enough, and the cell.
 
-    Where more blocks were asked for than the hash has slots, the shells stand in nothing, and the rows that there are
-    are looked through instead. Not so where what is not there is wanted: then it was found long before.
+    Once more blocks were visited than the hash has slots, the shells are mostly empty, and the existing rows are
+    scanned instead. This cannot happen if missing blocks are wanted: one would have been found long before.
     """
     hx, hy, hz = _home(p[0], side[0]), _home(p[1], side[1]), _home(p[2], side[2])
     best = (np.inf, hx, hy, hz)
@@ -67,7 +67,7 @@ def _nearest_of_rows(stored, rules, wanted, side, p, within, best, lately, marks
 
 @cell
 def _nearer(stored, rules, wanted, side, p, bx, by, bz, within, best, lately, marks, levels):
-    """Return what is nearest to p and not farther than `within`: `best`, or a cell of a block."""
+    """Return the nearest to p within `within`: `best`, or a cell of a block."""
     gx, gy, gz = _gap(p[0], 8 * bx, 8, side[0]), _gap(p[1], 8 * by, 8, side[1]), _gap(p[2], 8 * bz, 8, side[2])
     square = gx * gx + gy * gy + gz * gz
     if not (square < best[0] and square <= within):
@@ -114,7 +114,7 @@ def _gap(place, first, n, side):
 
 @cell
 def _to_shell(p, side, hx, hy, hz, shell):
-    """Return how far the shell of blocks is at least; nothing for the home block."""
+    """Return the least distance of a shell of blocks; 0 for the home block."""
     if shell == 0:
         return 0.0
     x = min((hx + shell) * 8 * side[0] - p[0], p[0] - (hx - shell + 1) * 8 * side[0])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that casts rays against a map: block by block, and cell by cell where a block holds what stops the ray.
+"""Kernel that casts rays against a map: block by block, and cell by cell if a block can stop the ray.
 
-A ray's place is counted in cells: start + t * slope, t in metres; it meets a face at (face - start) * per_cell
-(Amanatides and Woo 1987). A slope of zero counts as forward and meets no face.
+A ray's position is in cells: start + t * slope, t in metres; it meets a face at (face - start) * per_cell
+(Amanatides and Woo 1987). A zero slope counts as forward and meets no face.
 """
 
 import numpy as np
@@ -21,12 +21,12 @@ from stereovox.maps.query._query import (
 )
 
 LEVEL = 1e-300
-"""A slope up to it is none."""
+"""Slopes up to this count as zero."""
 
 
 @allocating_kernel
 def cast(stored, rules, wanted, side, origins, directions, farthest, distance, cells, states):
-    """Write how far each ray goes, the cell (n, 3) it stops in and this cell's state; leave what meets nothing.
+    """Write each ray's length, the cell (n, 3) it stops in and that cell's state; rays that hit nothing are unchanged.
 
     wanted: (1,) uint8, bits of the states that stop a ray. origins: (n, 3), or (1, 3) for all rays.
     """
@@ -66,9 +66,9 @@ def cast(stored, rules, wanted, side, origins, directions, farthest, distance, c
 
 @cell
 def _walk(start, slope, per_cell, step, t, row, bx, by, bz, marks):
-    """Walk through a block that is entered at `t`; return whether a marked cell was met, and where.
+    """Walk through a block entered at `t`; return whether a marked cell was hit, and where.
 
-    A block without a row is marked all over.
+    A block without a row is wholly marked.
     """
     x = min(max(_at(start[0], slope[0], t), bx << 3), (bx << 3) + 7)
     y = min(max(_at(start[1], slope[1], t), by << 3), (by << 3) + 7)
@@ -96,10 +96,10 @@ def _walk(start, slope, per_cell, step, t, row, bx, by, bz, marks):
 
 @cell
 def _aim(origin, direction, side):
-    """Return where a ray starts in cells, its slope in cells a metre, metres a cell, and its steps, three each."""
+    """Return a ray's start in cells, its slope in cells per metre, metres per cell, and its steps, three each."""
     x, y, z = direction[0], direction[1], direction[2]
     largest = max(abs(x), max(abs(y), abs(z)))
-    x, y, z = x / largest, y / largest, z / largest  # no square overflows, or vanishes for all three
+    x, y, z = x / largest, y / largest, z / largest  # no square overflows, and not all three vanish
     length = np.sqrt(x * x + y * y + z * z)
     slope = (x / length / side[0], y / length / side[1], z / length / side[2])
     start = (
@@ -135,14 +135,14 @@ def _meets(start, per_cell, face):
 
 @cell
 def _worth_clipping(stored, wanted, side, metres):
-    """Tell whether rays of that many metres ask for more blocks than the table has slots, and run on if none is."""
+    """Return whether rays of that length visit more blocks than the table has slots, and pass through missing ones."""
     blocks = 3 * metres / (8 * min(side[0], min(side[1], side[2])))
     return blocks > stored.table.size and (wanted[0] & UNKNOWN_BIT) == 0
 
 
 @cell
 def _clip(start, per_cell, low, high, end):
-    """Return from where to where a ray runs within blocks low..high, at most to `end`; a negative end: it does not."""
+    """Return the interval of a ray within blocks low..high, up to `end`; a negative end: it misses them."""
     t = np.float64(0)
     for axis in range(3):
         first, beyond = 8.0 * low[axis], 8.0 * (high[axis] + 1)

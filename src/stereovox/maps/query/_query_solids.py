@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that look for the worst cell in boxes and capsules.
+"""Kernels that find the worst cell in boxes and capsules.
 
-Blocks are asked for one by one. The walk is as long as the map is large and no longer: where more blocks were asked
-for than the hash has slots, one that is not there was among them, and only blocks with a row can be worse.
+Blocks are visited one by one, at most as many as the map is large: once more blocks were visited than the hash has
+slots, a missing one was among them, and only blocks with a row can be worse.
 """
 
 import numpy as np
@@ -13,15 +13,15 @@ from stereovox.maps.query._query import LATELY, NOWHERE, cells_from_zero, level_
 
 UNKNOWN_LEVEL, WORST_LEVEL = np.int32(0), np.int32(2)
 SLACK = 1e-9
-"""Blocks that much farther off are asked for too: what touches is decided cell by cell."""
+"""Blocks this much farther off are visited too: contact is decided cell by cell."""
 ZERO, ONE, EVERY_ROW = np.uint64(0), np.uint64(1), np.uint64(0x0101010101010101)
 
 
 @allocating_kernel
 def boxes(stored, rules, wanted, side, limit, low, high, out):
-    """Write the level of the worst cell of each box to `out` (n,), -1 where all is free.
+    """Write the level of the worst cell of each box to `out` (n,), -1 if all are free.
 
-    low, high: (n, 3) corners. wanted: (3,) uint8 states of each level, bit by bit: unknown, and two that are worse.
+    low, high: (n, 3) corners. wanted: (3,) uint8 bit set of states of each level: unknown, and two worse ones.
     """
     lately = np.full(LATELY, NOWHERE, np.int32)
     marks = np.empty((stored.values.shape[0], 3, 8), np.uint64)
@@ -37,7 +37,7 @@ def boxes(stored, rules, wanted, side, limit, low, high, out):
 
 @allocating_kernel
 def capsules(stored, rules, wanted, side, limit, begin, end, radius, out):
-    """Write the level of the worst cell that each capsule touches to `out` (n,), -1 where all is free.
+    """Write the level of the worst cell that each capsule touches to `out` (n,), -1 if all are free.
 
     begin, end: (n, 3) ends of the capsule's axis. radius: (n,), or (1,) for all. wanted: as for `boxes`.
     """
@@ -57,7 +57,7 @@ def capsules(stored, rules, wanted, side, limit, begin, end, radius, out):
 
 @cell
 def _span(low, high, side, limit):
-    """Return the first and the last cell from `low` to `high`, and whether there were more beyond the limit."""
+    """Return the first and the last cell from `low` to `high`, and whether cells beyond the limit were cut off."""
     first, last = np.floor(cells_from_zero(low, side)), np.floor(cells_from_zero(high, side))
     beyond = first <= -limit or last >= limit
     return np.int64(min(max(first, -limit), limit)), np.int64(min(max(last, -limit), limit)), beyond
@@ -92,7 +92,7 @@ def _worst_of_rows_in_box(stored, rules, wanted, box, worst, lately, marks, leve
 
 @cell
 def _worse_in_box(stored, rules, wanted, box, bx, by, bz, worst, lately, marks, levels):
-    """Return the worst level of the cells of a block that lie in a box, or `worst` if none is worse."""
+    """Return the worst level of the cells of a block inside a box, or `worst` if none is worse."""
     row = row_again(stored, lately, bx, by, bz)
     top = level_of(stored, rules, wanted, row, marks, levels)
     if row < 0 or top <= worst:
@@ -110,9 +110,9 @@ def _worse_in_box(stored, rules, wanted, box, bx, by, bz, worst, lately, marks, 
 
 @cell
 def _worst_in_capsule(stored, rules, wanted, side, solid, worst, lately, marks, levels):
-    """Walk through the blocks about the axis: those of an x, of them those of a y, of them those of a z.
+    """Walk through the blocks around the axis: by x, within these by y, within these by z.
 
-    What is left of the axis and of the radius shrinks on the way, so that few blocks are asked for in vain.
+    The remaining axis and radius shrink at each level, so that few blocks are visited in vain.
     """
     asked = 0
     wide, deep, tall = 8 * side[0], 8 * side[1], 8 * side[2]
@@ -145,14 +145,14 @@ def _worst_of_rows_in_capsule(stored, rules, wanted, side, solid, worst, lately,
 
 @cell
 def _blocks_about(start, slope, t, until, reach, width):
-    """Return the first and the last block that the axis from t to `until` comes as near as `reach`, on one axis."""
+    """Return the first and the last block within `reach` of the segment from t to `until`, on one axis."""
     a, b = start + t * slope, start + until * slope
     return np.int64(np.ceil((min(a, b) - reach) / width)) - 1, np.int64(np.floor((max(a, b) + reach) / width))
 
 
 @cell
 def _shrunk(start, slope, t, until, reach, low, high):
-    """Return the part of an axis that can be as near as `reach` to the slab low..high, and the reach that is left."""
+    """Return the part of an axis that can be within `reach` of the slab low..high, and the remaining reach."""
     if slope != 0:
         a, b = (low - reach - start) / slope, (high + reach - start) / slope
         t, until = min(max(min(a, b), t), until), max(min(max(a, b), until), t)
@@ -184,10 +184,10 @@ def _worse_in_capsule(stored, rules, wanted, side, solid, bx, by, bz, worst, lat
 
 @cell
 def _touches(solid, side, x, y, z, n):
-    """Tell whether a capsule comes to within its radius of the n x n x n cells from (x, y, z) on.
+    """Return whether a capsule comes within its radius of the n x n x n cells from (x, y, z).
 
-    The distance along the axis is convex, and its slope has a bend wherever the axis meets a face's plane: between
-    the two bends about the least distance the slope is a straight line.
+    The distance along the axis is convex, and its slope has a bend wherever the axis crosses a face's plane: between
+    the two bends around the minimum the slope is a straight line.
     """
     low = (x * side[0], y * side[1], z * side[2])
     high = ((x + n) * side[0], (y + n) * side[1], (z + n) * side[2])

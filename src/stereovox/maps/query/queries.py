@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries of planners: cells at points, rays, boxes, capsules, the nearest obstacle; one kernel call a batch.
+"""Queries for planners: cells at points, rays, boxes, capsules, the nearest obstacle; one kernel call per batch.
 
 `VoxelMap` offers them as methods.
 """
@@ -20,15 +20,15 @@ from stereovox.maps.query import _query, _query_nearest, _query_rays, _query_sol
 from stereovox.maps.storage.blocks import StoredCells
 
 INDEX_LIMIT = 2**30
-"""Cell indices lie in (-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
+"""Cell indices are in (-INDEX_LIMIT, INDEX_LIMIT); everything beyond is unknown."""
 NO_CELL = -(2**31)
-"""Stands on all three axes where no cell was found."""
+"""Index on all three axes if no cell was found."""
 BADNESS = (State.FREE, State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
 """States from best to worst for a planner."""
 
 
 class QueryTarget(NamedTuple):
-    """A map as queries read it: its cells, what their numbers mean, and their sides in metres."""
+    """A map as queries read it: its cells, the meaning of their numbers, and their sides in metres."""
 
     cells: StoredCells
     rules: CellRules
@@ -36,12 +36,12 @@ class QueryTarget(NamedTuple):
 
 
 class RayHits(NamedTuple):
-    """Where rays stopped.
+    """The cells that stopped rays.
 
-    distance: (N,) float32 metres from the origin to where the ray enters the cell that stops it; infinite where none
+    distance: (N,) float32 metres from the origin to where the ray enters the cell that stops it; infinite if none
         does.
-    cell: (N, 3) int32 this cell, NO_CELL if there is none.
-    state: (N,) uint8 `State` of this cell, UNKNOWN if there is none.
+    cell: (N, 3) int32 that cell, NO_CELL if there is none.
+    state: (N,) uint8 `State` of that cell, UNKNOWN if there is none.
     """
 
     distance: NDArray[np.float32]
@@ -50,17 +50,17 @@ class RayHits(NamedTuple):
 
     @classmethod
     def none(cls, number: int) -> RayHits:
-        """Return so many rays that nothing stops."""
+        """Return `number` rays that nothing stops."""
         return cls(
             np.full(number, np.inf, np.float32), np.full((number, 3), NO_CELL, np.int32), np.zeros(number, np.uint8)
         )
 
 
 class NearestCells(NamedTuple):
-    """What is nearest to points.
+    """The cells nearest to points.
 
     distance: (N,) float32 metres to the nearest face of the cell, 0 within it; infinite if nothing is near enough.
-    cell: (N, 3) int32 this cell, NO_CELL if there is none; one of them where several are as near.
+    cell: (N, 3) int32 that cell, NO_CELL if there is none; any one of several at equal distance.
     """
 
     distance: NDArray[np.float32]
@@ -68,17 +68,17 @@ class NearestCells(NamedTuple):
 
     @classmethod
     def none(cls, number: int) -> NearestCells:
-        """Return so many points that nothing is near."""
+        """Return `number` points with nothing near."""
         return cls(np.full(number, np.inf, np.float32), np.full((number, 3), NO_CELL, np.int32))
 
 
 def points_of(
     values: ArrayLike, name: str = "points", axes: int = 3, wanted: str = ""
 ) -> NDArray[np.float32] | NDArray[np.float64]:
-    """Return places (N, axes), float32 if they are, else float64; one place (axes,) is a batch of one, [] one of none.
+    """Return points (N, axes), float32 if given so, else float64; one point (axes,) is a batch of one, [] is empty.
 
-    wanted: what the caller takes, for the message. Raises StereovoxError for any other shape and for what is no number;
-    NaN and infinity are numbers.
+    wanted: what the caller takes, for the message. Raises StereovoxError for any other shape and for non-numbers; NaN
+    and infinity are numbers.
     """
     numbers = _numbers(values, name, f"numbers of shape (N, {axes})")
     if numbers.shape not in {(0,), (axes,)} and (numbers.ndim != 2 or numbers.shape[1] != axes):
@@ -88,7 +88,7 @@ def points_of(
 
 
 def shape_error(name: str, given: ArrayLike, wanted: str) -> StereovoxError:
-    """Return the error that names the shape and dtype of `given`, and what to give instead."""
+    """Return an error that names the shape and dtype of `given`, and what to give instead."""
     numbers, verb = np.asarray(given), "are" if name.endswith("s") and name != "radius" else "is"
     return StereovoxError(f"{name} {verb} {numbers.shape} {numbers.dtype}; give {wanted}")
 
@@ -96,7 +96,7 @@ def shape_error(name: str, given: ArrayLike, wanted: str) -> StereovoxError:
 def stored_at(
     cells: StoredCells, sides: tuple[float, float, float], points: NDArray[np.floating]
 ) -> NDArray[np.integer]:
-    """Return the stored numbers (N,) of the cells at points, "unknown" where not finite; points as of `points_of`."""
+    """Return the stored numbers (N,) of the cells at points, "unknown" if not finite; points as from `points_of`."""
     found = np.empty(len(points), cells.values.dtype)
     _query.look_up(cells, sides, INDEX_LIMIT, np.require(points, None, ["C", "W"]), found)
     return found
@@ -141,7 +141,7 @@ def check_capsules(asked: QueryTarget, start: ArrayLike, end: ArrayLike, radius:
 
 
 def nearest(asked: QueryTarget, points: ArrayLike, max_distance: float, obstacles: Iterable[State]) -> NearestCells:
-    """Return what is nearest to points; see `VoxelMap.nearest_obstacle`."""
+    """Return the cells nearest to points; see `VoxelMap.nearest_obstacle`."""
     points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), state_bits(obstacles, "obstacles")
     n = len(points)
     found = NearestCells.none(n)
@@ -175,7 +175,7 @@ def _each(states: Iterable[int]) -> NDArray[np.uint8]:
 
 
 def numbers_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return numbers of any shape; raises StereovoxError for what is none, NaN among it."""
+    """Return numbers of any shape; raises StereovoxError for non-numbers, including NaN."""
     numbers = _numbers(values, name, "numbers").astype(float)
     if np.isnan(numbers).any():
         raise StereovoxError(f"{name}: NaN is not a value; give numbers")
@@ -198,7 +198,7 @@ def _shortened(values: object) -> str:
 
 
 def _vectors(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return (N, 3) finite numbers of one's own."""
+    """Return a copy as (N, 3) finite numbers."""
     vectors = np.array(points_of(values, name), float, order="C")
     if not np.isfinite(vectors).all():
         raise StereovoxError(f"{name}: number {np.flatnonzero(~np.isfinite(vectors).all(axis=1))[0]} is not finite")
@@ -216,7 +216,7 @@ def _lengths(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def distance_of(metres: float) -> float:
-    """Return a largest distance as a number; raises StereovoxError for what is no length of 0 m or more."""
+    """Return a largest distance as a number; raises StereovoxError unless it is a length of 0 m or more."""
     lengths = _lengths(metres, "max_distance")
     if len(lengths) != 1:
         raise StereovoxError(f"max_distance: {len(lengths)} lengths; give one for all")
@@ -224,7 +224,7 @@ def distance_of(metres: float) -> float:
 
 
 def _within_limits(asked: QueryTarget, numbers: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Return metres (N, 3) or (N,) as they are."""
+    """Return metres (N, 3) or (N,) unchanged."""
     limit = INDEX_LIMIT * np.array(asked.sides)
     if not (np.abs(numbers) < (limit if numbers.ndim > 1 else min(limit))).all():
         raise StereovoxError(f"{name}: beyond the map, whose cells reach {min(limit) / 1000:.0f} km from its origin")

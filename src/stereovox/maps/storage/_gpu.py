@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that keep the blocks of a map on a graphics card: the loops of `_add.py` and `_pool.py` over the same cells.
 
-The hash table is that of `_cells.py`. Entries come by compare-and-swap, in a kernel of their own: none is looked up
-while others are made, so an entry that is seen has its coordinates.
+The hash table is the one of `_cells.py`. Entries are inserted by compare-and-swap, in a separate kernel: no lookup runs
+during insertion, so a visible entry always has its coordinates.
 """
 
 import math
@@ -15,7 +15,7 @@ from stereovox.maps.cells._add import MAKE, SKIP
 from stereovox.maps.cells._cells import EMPTY
 
 USED, MISSING, CHANGED = 0, 1, 2
-"""Places in `counts` (COUNTS,) int32: rows in use; rows that evidence needs; cells that it changed."""
+"""Places in `counts` (COUNTS,) int32: rows in use; rows that evidence needs; cells that evidence changed."""
 COUNTS = 3
 
 find, home_slot = on_gpu(_cells.find), on_gpu(_cells.home_slot)
@@ -25,7 +25,7 @@ chosen, weighed, looked_through = on_gpu(_add.chosen), on_gpu(_add.weighed), on_
 
 @gpu_kernel
 def find_places(table, coords, wanted, said, n, places, counts):
-    """Write the row of each of the first `n` blocks of `wanted`, or SKIP, or MAKE, to `places`; count the latter.
+    """Write the row of each of the first `n` blocks of `wanted`, or SKIP, or MAKE, to `places`; count the last.
 
     said: (n,) int16, 0 for blocks about which there is no evidence.
     """
@@ -41,7 +41,7 @@ def find_places(table, coords, wanted, said, n, places, counts):
 
 @gpu_kernel
 def make_rows(table, coords, counts, wanted, n, places):
-    """Make a row for each of the first `n` blocks of `wanted` marked MAKE, and write it there; there must be room."""
+    """Make a row for each of the first `n` blocks of `wanted` marked MAKE, and write its index; there must be room."""
     for i in range(cuda.grid(1), n, cuda.gridsize(1)):
         if places[i] == MAKE:
             row = cuda.atomic.add(counts, USED, 1)
@@ -55,7 +55,7 @@ def make_rows(table, coords, counts, wanted, n, places):
 
 @gpu_kernel
 def enter_all(table, coords, n):
-    """Enter the first `n` blocks of the pool, each of which is there once, into an empty hash table."""
+    """Insert the first `n` blocks of the pool, all different, into an empty hash table."""
     for place in range(cuda.grid(1), n, cuda.gridsize(1)):
         slot = home_slot(coords[place, 0], coords[place, 1], coords[place, 2], table.size - 1)
         while cuda.atomic.cas(table, slot, EMPTY, np.int32(place)) != EMPTY:
@@ -91,7 +91,7 @@ def add(values, places, steps, n, limits, counts):
 
 @gpu_kernel
 def add_uniform(values, places, steps, n, limits, counts):
-    """Add to all cells of the rows at `places` one of `steps` (n,) int16 each, as `add` does."""
+    """Add one of `steps` (n,) int16 to all cells of each row at `places`, as `add` does."""
     unknown, prior, lowest, highest = limits
     for i in range(cuda.blockIdx.x, n, cuda.gridDim.x):
         row = places[i]
@@ -108,7 +108,7 @@ def add_uniform(values, places, steps, n, limits, counts):
 
 @gpu_kernel
 def rescale(values, n, factor, shift, most, out):
-    """Do what `_add.rescale` does with the first `n` rows of `values`."""
+    """Apply `_add.rescale` to the first `n` rows of `values`."""
     for i in range(cuda.grid(1), 512 * n, cuda.gridsize(1)):
         out[i >> 9, i & 511] = rescaled(values[i >> 9, i & 511], factor, shift, most)
 

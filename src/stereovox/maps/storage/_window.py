@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the rolling map: forget what left the window, cut evidence at its border."""
+"""Kernels of the rolling map: clear cells that left the window, clip evidence at its border."""
 
 from stereovox.kernels._jit import cell, kernel
 from stereovox.maps.cells._cells import copy_row, find
@@ -8,7 +8,7 @@ from stereovox.maps.cells._pool import NOTHING, forget, need, with_row
 
 @kernel
 def vacate(table, coords, values, count, unknown, lowest, slab_low, slab_high, low, high):
-    """Forget the cells of a slab that lie outside the window, and blocks of which nothing known is left.
+    """Clear the cells of a slab outside the window, and remove blocks without remaining known cells.
 
     slab_low, slab_high, low, high: (3,) int32 first cell and first cell beyond, of the slab and of the window.
     """
@@ -27,9 +27,9 @@ def vacate(table, coords, values, count, unknown, lowest, slab_low, slab_high, l
 
 @kernel
 def clip(coords, values, uniform, uniform_values, low, high, out_coords, out_values, out_uniform, out_uniform_values):
-    """Copy the evidence on cells of the window [low, high); return the number of blocks, and of uniform blocks.
+    """Copy the evidence on cells within the window [low, high); return the number of blocks, and of uniform blocks.
 
-    Uniform blocks on the border become ordinary ones.
+    Uniform blocks across the border become ordinary ones.
     """
     n = 0
     for i in range(coords.shape[0]):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sparse set of blocks of 8x8x8 cells: a pool of values and a hash from block coordinates to the pool.
 
-Integrators collect evidence in it, and grids keep their tiles: blocks of other sizes at height 0. Voxel maps have a
-pool of their own (`CellPool`).
+Integrators collect evidence in it, and grids keep their tiles in it: blocks of other sizes at height 0. Voxel maps have
+their own pool (`CellPool`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ SIDE = 8
 """Cells along each side of a block."""
 CELLS = SIDE**3
 MAX_PLACES = 2**62
-"""Places in a box that one int64 can count."""
+"""Most places in a box that one int64 can count."""
 
 
 def blocks_of_cells(cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the blocks (n, 3) that hold cells (N, 3), each once in ascending order, and which of them each is in (N,).
+    """Return the blocks (n, 3) that contain cells (N, 3), each once in ascending order, and the block index of each
+    cell (N,).
 
-    Blocks are told apart by one number each, which sorts much sooner than rows of three.
+    Each block gets one number, which sorts much faster than rows of three.
     """
     coords = np.asarray(cells, np.int64) >> 3
     if not len(coords):
@@ -55,17 +56,17 @@ def span_of(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[i
 
 
 class StoredCells(NamedTuple):
-    """All cells of a map as kernels read them, with `row_of` and `number_in` of `_cells.py`; never written to."""
+    """All cells of a map as kernels read them, with `row_of` and `number_in` of `_cells.py`; read-only."""
 
     table: NDArray[np.int32]
     coords: NDArray[np.int32]  # (rows + bare, 3): of blocks with a row, then of those without, all at `lowest`
     values: NDArray[np.integer]  # (rows, 512)
-    unknown: np.int32  # what a cell without evidence holds
-    lowest: np.int32  # the lowest number a cell can hold
+    unknown: np.int32  # the value of a cell without evidence
+    lowest: np.int32  # the lowest value of a cell
 
 
 class BlockPool:
-    """Blocks in the order they were made. Cell (i, j, k) of a block stands at `64 i + 8 j + k` of its row.
+    """Blocks in the order of creation. Cell (i, j, k) of a block is at `64 i + 8 j + k` of its row.
 
     coords: (capacity, 3) int32 block coordinates; block (0, 0, 0) holds cells 0..7 on each axis.
     values: (capacity, `cells`) of the chosen dtype, `fill` where never written.
@@ -100,21 +101,21 @@ class BlockPool:
         _pool.rebuild_all(self.table, self.coords, len(self))
 
     def insert(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Find or make blocks (n, 3); return their places in the pool (n,)."""
+        """Find or create blocks (n, 3); return their places in the pool (n,)."""
         self.reserve(len(coords))
         places = np.empty(len(coords), np.int64)
         _pool.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
         return places
 
     def clear(self) -> None:
-        """Forget all blocks and what they held; the memory stays for the next use."""
+        """Remove all blocks and their content; the memory is kept for the next use."""
         self.values[: len(self)] = self.fill
         self.table.fill(-1)
         self.count[0] = 0
 
 
 def table_size(capacity: int) -> int:
-    """Return the number of slots of a hash table for so many blocks, a power of two: less than half of it is in use."""
+    """Return the slots of a hash table for `capacity` blocks, a power of two: less than half is in use."""
     return 1 << int(2 * capacity - 1).bit_length()
 
 
@@ -125,5 +126,5 @@ def _grown(array: NDArray, capacity: int, used: int, fill: int) -> NDArray:
 
 
 def _filled(shape: tuple[int, ...], fill: int, dtype: DTypeLike) -> NDArray:
-    """Return an array of `fill`; the system gives the memory of zeros only when it is first used."""
+    """Return an array of `fill`; the system provides memory of zeros only on first use."""
     return np.full(shape, fill, dtype) if fill else np.zeros(shape, dtype)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Storage of a map in boxes that is used without being loaded: the boxes asked for last are kept, up to a size."""
+"""Storage of a map in boxes that is used without loading it: recently used boxes are cached, up to a size."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from stereovox.maps.storage.memory import format_bytes
 from stereovox.maps.storage.storage import Blocks, Storage
 
 CACHE_BYTES = 256_000_000
-"""Memory for the boxes that were asked for last."""
+"""Memory for recently used boxes."""
 PER_BLOCK = 32
-"""Bytes of a block's coordinates and its places in the hash, about."""
+"""Approximate bytes of a block's coordinates and hash slots."""
 NEAR = 0.01
-"""A place this near to the face of a cell, in cells, may count as in the next one."""
+"""A point this near to a cell's face, in cells, may count as in the next cell."""
 
 Wanted = Callable[[BoxEntry], bool]
-"""Tells whether a box must be read to answer a question."""
+"""Returns whether a box must be read to answer a query."""
 
 
 def any_box(entry: BoxEntry) -> bool:
-    """Tell that a box must be read, whatever is in it."""
+    """Return that a box must be read, whatever its content."""
     return True
 
 
 class BoxedStorage(Storage):
-    """The blocks of a map in boxes; they are read when they are asked for, and never changed.
+    """The blocks of a map in boxes; they are read on demand, and never changed.
 
-    Whatever asks about places goes by `parts`, which reads the boxes around them. What wants all cells at once
-    (`stored_cells`) gets them where they fit into the cache, and an error that names the cure where they do not;
-    `slabs` reads the map box by box.
+    Queries at points use `parts`, which reads the boxes around them. `stored_cells`, which needs all cells at once,
+    works only if they fit into the cache, and otherwise raises an error that names the cure; `slabs` reads the map box
+    by box.
 
-    place, manifest: where the map is, and what it consists of. cache_bytes: memory for boxes; it is bounded by them.
+    place, manifest: location and content of the map. cache_bytes: memory limit of the cached boxes.
     """
 
     bounded = True
@@ -77,11 +77,11 @@ class BoxedStorage(Storage):
     def parts(
         self, low: NDArray[np.integer], high: NDArray[np.integer], wanted: Wanted = any_box
     ) -> Iterator[NDArray[np.int64]]:
-        """Yield the numbers (m,) of items, some at a time, while the boxes they need can be read in `cells_here`.
+        """Yield indices (m,) of items in groups; meanwhile the boxes they need are in `cells_here`.
 
-        low, high: cells (N, 3) from the lowest to the highest that each item needs, both included. wanted: boxes
-        that it is false for may be left out; their cells are then unknown. Raises StereovoxError for an item that
-        needs more than the cache holds, and MapFileError for a damaged box.
+        low, high: cells (N, 3) from the lowest to the highest that each item needs, both included. wanted: boxes for
+        which it is false may be skipped; their cells are then unknown. Raises StereovoxError for an item that needs
+        more than the cache holds, and MapFileError for a damaged box.
         """
         if not len(low):
             return
@@ -104,22 +104,22 @@ class BoxedStorage(Storage):
 
     @property
     def bytes_of_all(self) -> int:
-        """Bytes that all boxes would take in memory."""
+        """Bytes of all boxes in memory."""
         return self._cost(self._entries)
 
     @property
     def cells_here(self) -> StoredCells:
-        """The cells of the boxes that are in the cache, for kernels; other cells are unknown there."""
+        """The cells of the cached boxes, for kernels; all others are unknown."""
         return self._pool.stored_cells
 
     @property
     def stored_cells(self) -> StoredCells:
-        """All cells, for kernels that only read. Raises StereovoxError if they do not fit into the cache."""
+        """All cells, for read-only kernels. Raises StereovoxError if they do not fit into the cache."""
         self._load(self._entries)
         return self._pool.stored_cells
 
     def cells_within(self, low: ArrayLike, high: ArrayLike) -> StoredCells:
-        """Return cells that hold those from `low` (3,) to below `high` (3,), for kernels that only read."""
+        """Return cells that include those from `low` (3,) to below `high` (3,), for read-only kernels."""
         for _ in self.parts(np.reshape(low, (1, 3)), np.reshape(high, (1, 3)) - 1):
             pass
         return self._pool.stored_cells
@@ -164,7 +164,7 @@ class BoxedStorage(Storage):
         return np.concatenate(coords), np.concatenate(cells)
 
     def blocks(self) -> Blocks:
-        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
+        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as stored."""
         coords, cells = super().blocks()
         order = np.lexsort(coords.T[::-1])
         return coords[order], cells[order]
@@ -174,23 +174,23 @@ class BoxedStorage(Storage):
         yield from self.slabs()
 
     def check_can_grow(self) -> None:
-        """Raise StereovoxError: nothing is added to a map in boxes."""
+        """Raise StereovoxError: nothing can be added to a map in boxes."""
         self._refuse()
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Raise StereovoxError: a map in boxes is only read."""
+        """Raise StereovoxError: a map in boxes is read-only."""
         self._refuse()
 
     def set_viewpoint(self, viewpoint: Viewpoint) -> None:
-        """Raise StereovoxError: a map in boxes is only read."""
+        """Raise StereovoxError: a map in boxes is read-only."""
         self._refuse()
 
     def add(self, evidence: Evidence) -> int:
-        """Raise StereovoxError: a map in boxes is only read."""
+        """Raise StereovoxError: a map in boxes is read-only."""
         self._refuse()
 
     def continue_with(self, config: Config) -> None:
-        """Raise StereovoxError: a map in boxes is only read."""
+        """Raise StereovoxError: a map in boxes is read-only."""
         self._refuse()
 
     def _refuse(self) -> NoReturn:
@@ -204,7 +204,7 @@ class BoxedStorage(Storage):
         return CELLS * self.cell_format.dtype.itemsize
 
     def _ranges(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the first and last box (N, 6) that hold cells from `low` (N, 3) to `high`, cut to where boxes are."""
+        """Return the first and last box (N, 6) for cells from `low` (N, 3) to `high`, clipped to existing boxes."""
         if not len(self._boxes):
             return np.zeros((len(low), 6), np.int64)
         ends = self._boxes.min(axis=0) - 1, self._boxes.max(axis=0) + 1
@@ -221,13 +221,13 @@ class BoxedStorage(Storage):
         return [(i, j, k) for i, j, k in product(*spans) if (i, j, k) in self._entries]
 
     def _cost(self, boxes: Iterable[Index]) -> int:
-        """Return the bytes that boxes take in memory."""
+        """Return the bytes of boxes in memory."""
         per_time = 0 if self._times is None else 4 * CELLS
         entries = (self._entries[box] for box in boxes)
         return sum(entry.rows * self._row_bytes + entry.blocks * (PER_BLOCK + per_time) for entry in entries)
 
     def _load(self, boxes: Iterable[Index]) -> None:
-        """Bring boxes into the cache; those that were not asked for the longest time make room."""
+        """Load boxes into the cache; the least recently used make room."""
         boxes = list(boxes)
         if (needed := self._cost(boxes)) > self.cache_bytes:
             raise StereovoxError(
@@ -241,13 +241,13 @@ class BoxedStorage(Storage):
                 self._loaded.move_to_end(box)
         self._make_room(self.cache_bytes - self._cost(missing))
         with ThreadPoolExecutor(AT_ONCE) as pool:
-            for start in range(0, len(missing), AT_ONCE):  # so that few wait to be put into the cache
+            for start in range(0, len(missing), AT_ONCE):  # so that few wait for the cache
                 some = missing[start : start + AT_ONCE]
                 for box, blocks in zip(some, pool.map(self._read, some), strict=True):
                     self._put(box, blocks)
 
     def _make_room(self, most: int) -> None:
-        """Forget boxes until those in the cache take no more than `most` bytes."""
+        """Evict boxes until the cache takes no more than `most` bytes."""
         while self._used > most:
             box, coords = self._loaded.popitem(last=False)
             self._used -= self._cost([box])
@@ -263,12 +263,12 @@ class BoxedStorage(Storage):
             self._times.put(blocks.coords, blocks.times)
 
     def _read(self, box: Index) -> BoxBlocks:
-        """Return the blocks of one box from its files, without keeping them; several threads may."""
+        """Return the blocks of one box from its files, without caching them; thread-safe."""
         entry = self._entries[box]
         return self._as_mine(entry, read_box(self.place, self.manifest.layout, entry))
 
     def _as_mine(self, entry: BoxEntry, blocks: BoxBlocks) -> BoxBlocks:
-        """Return the blocks of a box with numbers that cells can have, and times that count as those of this map."""
+        """Return the blocks of a box with values clamped to the cells' limits, and times rebased to this map's."""
         cells = np.clip(blocks.cells, self.rules.lowest, self.rules.highest).astype(self.cell_format.dtype, copy=False)
         times, start_ns = blocks.times, self.manifest.times_start_ns
         if times is not None and entry.times_start_ns not in (start_ns, None) and start_ns is not None:

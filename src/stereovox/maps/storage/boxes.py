@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes: a map cut into axis-aligned cubes of whole blocks, each of them one sharded Zarr v3 group.
+"""Boxes: a map cut into axis-aligned cubes of whole blocks, each one sharded Zarr v3 group.
 
-A box is written under a name made of its content and is part of a map once a manifest names it, so whatever is killed
-in between leaves the older map whole. Zarr's own headers are for other programs: here each box is read in the one form
-that it is written in, with sizes checked before anything is unpacked, so a stranger's map takes no more memory than its
-bytes account for.
+A box is named after its content and joins a map once a manifest names it, so a kill in between leaves the older map
+intact. Zarr's own headers are for other programs: here each box is read only in the exact form written here, with sizes
+checked before anything is unpacked, so a stranger's map takes no more memory than its bytes account for.
 """
 
 from __future__ import annotations
@@ -33,18 +32,18 @@ from stereovox.maps.storage.storage import Storage
 BOXES = "boxes"
 """Folder of all boxes of a map."""
 NAME = re.compile(rf"{BOXES}/[0-9]{{1,2}}/-?[0-9]{{1,9}}_-?[0-9]{{1,9}}_-?[0-9]{{1,9}}-[0-9a-f]{{16}}")
-"""Name of a box: level, index, and a digest of what it holds."""
+"""Name of a box: level, index, and a digest of its content."""
 MAX_SIDE = 512
-"""Cells along the longest side of a box; one that is full takes a quarter of a gigabyte."""
+"""Cells along the longest side of a box; a full one takes a quarter of a gigabyte."""
 ROWS = 1024
 """Blocks of an inner chunk."""
 PACKED_BEST = 100
-"""Coordinates that claim to unpack to more than so many times their bytes are rejected."""
+"""Coordinates that claim to unpack to more than this many times their bytes are rejected."""
 MISSING = (1 << 64) - 1
-"""Marks an inner chunk that a shard does not hold."""
+"""Marks an inner chunk missing from a shard."""
 ARRAYS = ("coords", "cells", "times")
-CURE = "make the map anew (a fleet makes what is missing with --resume)"
-"""Of a box that cannot be read."""
+CURE = "make the map again (a fleet makes missing boxes with --resume)"
+"""Cure for an unreadable box."""
 
 Index = tuple[int, int, int]
 
@@ -53,7 +52,7 @@ class BoxBlocks(NamedTuple):
     """The blocks of a box.
 
     coords: (n, 3) int32 in ascending order; cells: (n, 512) as stored; times: (n, 512) uint32, None if none are
-    kept; they count from `times_start_ns`.
+    kept; counted from `times_start_ns`.
     """
 
     coords: NDArray[np.int32]
@@ -63,12 +62,12 @@ class BoxBlocks(NamedTuple):
 
 
 class BoxEntry(NamedTuple):
-    """What a manifest says of one box.
+    """A manifest's entry of one box.
 
-    box: which one, (i, j, k). name: of its Zarr group below the map. blocks, rows: how many blocks it has, and how many
-    of them are not bare (all cells as free as can be). free, tentative, occupied: cells. low, high: cells (3,) from the
-    lowest known to the first beyond the highest. bytes: of its arrays in the store. checksum: CRC-32 of the bytes of
-    each array. times_start_ns: from when times count.
+    box: index (i, j, k). name: of its Zarr group below the map. blocks, rows: number of blocks, and of those that are
+    not bare (all cells as free as possible). free, tentative, occupied: cells. low, high: cells (3,) from the lowest
+    known to the first beyond the highest. bytes: of its arrays in the store. checksum: CRC-32 of the bytes of each
+    array. times_start_ns: origin of times.
     """
 
     box: Index
@@ -90,7 +89,7 @@ class BoxEntry(NamedTuple):
 
     @classmethod
     def loaded(cls, saved: dict[str, Any], layout: BoxLayout) -> BoxEntry:
-        """Return a saved entry. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        """Return a saved entry. Raises KeyError, TypeError or ValueError for invalid values."""
         box, low, high = (_three(saved[name]) for name in ("box", "low", "high"))
         counts = {name: _count(saved[name]) for name in ("blocks", "rows", "free", "tentative", "occupied", "bytes")}
         checksum, start_ns = tuple(map(_count, saved["checksum"])), saved.get("times_start_ns")
@@ -105,11 +104,11 @@ class BoxEntry(NamedTuple):
 
 
 class BoxLayout:
-    """How a map is cut: its settings, and the side of a box.
+    """The division of a map into boxes: its settings, and the side of a box.
 
     config: settings of the map, or of one level of its pyramid. side: of a box in cells, a multiple of 8 up to
-    MAX_SIDE. level: how often cells were merged by two along each axis; 0 for the map itself. Raises StereovoxError for
-    another side.
+    MAX_SIDE. level: how often cells were merged in pairs along each axis; 0 for the map itself. Raises StereovoxError
+    for another side.
     """
 
     def __init__(self, config: Config, side: int, level: int = 0):
@@ -119,7 +118,7 @@ class BoxLayout:
 
     @cached_property
     def rules(self) -> CellRules:
-        """What stored numbers mean."""
+        """Meaning of stored numbers."""
         return CellRules(self.config.map)
 
     @property
@@ -129,21 +128,21 @@ class BoxLayout:
 
     @property
     def dtypes(self) -> list[np.dtype[Any]]:
-        """Types of the arrays of a box: coordinates, cells, and times where they are kept."""
+        """Types of the arrays of a box: coordinates, cells, and times if they are kept."""
         kept = [np.dtype(np.int32), self.rules.format.dtype, np.dtype(np.uint32)]
         return kept[: 3 if self.config.map.keep_times else 2]
 
     def blocks_of(self, index: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the lowest block (3,) of a box, and the first beyond its highest."""
+        """Return the lowest block (3,) of a box, and the first block beyond its highest."""
         low = np.array(index, np.int64) * (self.side // SIDE)
         return low, low + self.side // SIDE
 
     def indices_of(self, coords: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the index (n, 3) of the box that holds each block (n, 3)."""
+        """Return the index (n, 3) of the box that contains each block (n, 3)."""
         return np.asarray(coords, np.int64) // (self.side // SIDE)
 
     def check(self, entry: BoxEntry) -> None:
-        """Raise ValueError for an entry that no box of this map can have."""
+        """Raise ValueError for an entry that is impossible in this map."""
         low, high = (SIDE * corner for corner in self.blocks_of(entry.box))
         most = (self.side // SIDE) ** 3
         expected = f"{BOXES}/{self.level}/{'_'.join(map(str, entry.box))}-"
@@ -160,10 +159,10 @@ class BoxLayout:
 
 
 def write_box(place: Place, layout: BoxLayout, index: Sequence[int], storage: Storage) -> BoxEntry | None:
-    """Write the blocks that `storage` has in one box; return its entry for a manifest, None if no cell is known.
+    """Write the blocks of `storage` in one box; return its entry for a manifest, None if no cell is known.
 
-    Nothing is a part of any map until a manifest names it. The same content has the same name, so a box that is written
-    again after a kill takes no more room. Raises MapFileError if it cannot be written.
+    A box is part of no map until a manifest names it. Equal content has an equal name, so a box that is written again
+    after a kill takes no extra room. Raises MapFileError if it cannot be written.
     """
     coords, cells = storage.blocks_within(*layout.blocks_of(index))
     order = np.lexsort(coords.T[::-1])
@@ -175,7 +174,7 @@ def write_box(place: Place, layout: BoxLayout, index: Sequence[int], storage: St
 
 
 def write_blocks(place: Place, layout: BoxLayout, index: Sequence[int], blocks: BoxBlocks) -> BoxEntry | None:
-    """Write one box of these blocks as `write_box` does; those without a known cell are left out."""
+    """Write one box of these blocks as `write_box` does; blocks without a known cell are left out."""
     known = blocks.cells != layout.rules.format.unknown
     some = known.any(axis=1)
     if not some.any():
@@ -204,13 +203,13 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
     shards = [data for file in files if (data := place.find(file, entry.bytes)) is not None]
     if len(shards) < len(files):
         raise MapFileError(
-            f"{place}/{entry.name}: is not there; was the map made anew meanwhile? load it again, or {CURE}"
+            f"{place}/{entry.name}: is missing; was the map made again meanwhile? load it again, or {CURE}"
         )
     try:
         if tuple(map(zlib.crc32, shards)) != entry.checksum:
             raise ValueError("the cells do not match their checksum")
         if entry.blocks * 12 > max(1 << 16, PACKED_BEST * len(shards[0])):
-            raise ValueError(f"{entry.blocks} blocks where there are {len(shards[0])} bytes")
+            raise ValueError(f"{entry.blocks} blocks in {len(shards[0])} bytes")
         coords, cells, *times = (
             _unpacked(shard, entry.blocks, _width(name), dtype)
             for shard, (name, dtype) in zip(shards, zip(ARRAYS, layout.dtypes, strict=False), strict=True)
@@ -226,7 +225,7 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
 
 
 def is_there(layout: BoxLayout, entry: BoxEntry, sizes: Mapping[str, int]) -> bool:
-    """Tell whether the arrays of a box are complete among the files of a place, whose bytes these are."""
+    """Return whether the arrays of a box are complete among the files of a place; sizes: their bytes."""
     shards = [f"{entry.name}/{_shard(name)}" for name in ARRAYS[: len(layout.dtypes)]]
     return all(name in sizes for name in shards) and sum(sizes[name] for name in shards) == entry.bytes
 
@@ -236,7 +235,7 @@ def _shard(name: str) -> str:
 
 
 def _packed(layout: BoxLayout, arrays: list[NDArray]) -> dict[str, bytes]:
-    """Return the files of a Zarr group that holds these arrays, each of them in one shard; the headers come last."""
+    """Return the files of a Zarr group with these arrays, each in one shard; headers are last."""
     store: dict[str, Any] = {}
     group = _group(store, {"cell": layout.config.cell, "side": layout.side, "level": layout.level})
     for array, (name, dtype) in zip(arrays, zip(ARRAYS, layout.dtypes, strict=False), strict=True):
@@ -245,9 +244,9 @@ def _packed(layout: BoxLayout, arrays: list[NDArray]) -> dict[str, bytes]:
 
 
 def _unpacked(shard: bytes, blocks: int, width: int, dtype: np.dtype[Any]) -> NDArray:
-    """Return the array (blocks, width) in a shard; raises ValueError if its chunks would not unpack to just that.
+    """Return the array (blocks, width) in a shard; raises ValueError if its chunks would not unpack to exactly that.
 
-    Zarr reads it as well, in ten times as long.
+    Zarr can read it too, but takes ten times as long.
     """
     from numcodecs.zstd import decompress
 
@@ -260,7 +259,7 @@ def _unpacked(shard: bytes, blocks: int, width: int, dtype: np.dtype[Any]) -> ND
     size = array[:rows].nbytes
     for k, (offset, length) in enumerate(struct.iter_unpack("<QQ", shard[body:-4])):
         if offset == length == MISSING or offset + length > body:
-            raise ValueError("a chunk that is not there")
+            raise ValueError("a chunk is missing")
         packed = shard[offset : offset + length]
         if zstd_size(packed[:18]) != size:
             raise ValueError(f"a chunk that does not unpack to {size} bytes")
@@ -294,7 +293,7 @@ def _check_coords(layout: BoxLayout, entry: BoxEntry, coords: NDArray[np.int32])
     """Raise ValueError for blocks outside the box, out of order or named twice."""
     low, high = layout.blocks_of(entry.box)
     if ((coords < low) | (coords >= high)).any():
-        raise ValueError("a block outside the box")
+        raise ValueError("a block is outside the box")
     n = layout.side // SIDE
     if (np.diff((coords - low) @ [n * n, n, 1]) <= 0).any():
         raise ValueError("blocks out of order")
@@ -303,7 +302,7 @@ def _check_coords(layout: BoxLayout, entry: BoxEntry, coords: NDArray[np.int32])
 def _three(numbers: Any) -> Index:
     x, y, z = map(int, numbers)
     if max(map(abs, (x, y, z))) > INDEX_LIMIT:
-        raise ValueError("a cell that lies too far away")
+        raise ValueError("a cell is out of range")
     return x, y, z
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resample maps with cells that are not cubes, for drawing and for file formats that know cubes only."""
+"""Resample maps with cells that are not cubes, for drawing and for file formats with cubes only."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps.voxel_map import VoxelMap
 
 TIE = 1e-6
-"""Cubes: a centre so near to a face stands on it, and belongs to the cell above."""
+"""A centre this near to a face, in cubes, is on it and belongs to the cell above."""
 
 
 @one_state
 def in_cubes(voxel_map: VoxelMap) -> VoxelMap:
-    """Return the map in cubes of the smallest side of its cells; a map of cubes is returned as it is.
+    """Return the map in cubes of the smallest side of its cells; a map of cubes is returned unchanged.
 
-    A cube has the state of the cell that holds its centre.
+    A cube has the state of the cell that contains its centre.
     """
     if voxel_map.config.steps is None:
         return voxel_map

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose blocks are on a graphics card, and evidence that is there: they meet without leaving it.
+"""A map whose blocks are on a graphics card, and evidence there: they meet without leaving it.
 
-The map comes to the processor when somebody asks for its cells, all of it at once, and stays until the next frame.
-Imported only where `device = "cuda"`.
+Reading cells copies the whole map to the processor, where the copy stays valid until the next frame.
+Imported only if `device = "cuda"`.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from stereovox.maps.storage.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
 
 ROOM = 4096
-"""Blocks for which a new map has room: 4 MB of cells of 16 bits."""
+"""Initial capacity of a map in blocks: 4 MB of cells of 16 bits."""
 
 
 class GpuArrays(NamedTuple):
-    """Arrays of a frame's evidence on the card, with room for more blocks than there are."""
+    """Arrays of a frame's evidence on the card, with room for more blocks."""
 
     coords: Any  # (room, 3) int32
     values: Any  # (room, 512) int16
-    said: Any  # (room,) int16, 0 where all of a block's values are
+    said: Any  # (room,) int16, 0 if all of a block's values are
     uniform: Any  # (room, 3) int32
-    steps: Any  # (room,) int16; 0: a block that counts as nothing
+    steps: Any  # (room,) int16; 0: a block to ignore
 
 
 class GpuEvidence(Evidence):
-    """Evidence of one frame on the card; read like any other, it is copied from there.
+    """Evidence of one frame on the card; reading it copies it from there.
 
     arrays: the first `n` blocks and the first `m` uniform ones count.
     """
@@ -56,7 +56,7 @@ class GpuEvidence(Evidence):
 
     @classmethod
     def of(cls, evidence: Evidence) -> GpuEvidence:
-        """Return evidence on the card: the same where it is there."""
+        """Return evidence on the card: the same object if it is already there."""
         if isinstance(evidence, GpuEvidence):
             return evidence
         said = evidence.values.any(axis=1).astype(np.int16)
@@ -81,7 +81,7 @@ class GpuEvidence(Evidence):
 
     @cached_property
     def uniform_values(self) -> NDArray[np.int16]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What all cells of each get (m',)."""
+        """Evidence for all cells of each (m',)."""
         return from_gpu(self.arrays.steps, self.m)[self._counts]
 
     @cached_property
@@ -90,7 +90,7 @@ class GpuEvidence(Evidence):
 
 
 def _not_empty(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array, of one zero row if it has none: the card knows no empty memory."""
+    """Return an array, or one zero row if it is empty: the card has no empty arrays."""
     return array if len(array) else np.zeros((1, *array.shape[1:]), array.dtype)
 
 
@@ -100,9 +100,10 @@ def from_gpu(array: Any, n: int) -> NDArray[Any]:
 
 
 class GpuPool:
-    """All blocks of a map on the card, for reading as in `CellPool`; each has a row of numbers, also one at the floor.
+    """All blocks of a map on the card, for reading as in `CellPool`; each has a row of numbers, even at the floor
+    value.
 
-    Rows that are not in use hold `unknown`. rows: for how many there is room at the start.
+    Unused rows hold `unknown`. rows: initial capacity.
     """
 
     def __init__(self, rules: CellRules, rows: int):
@@ -129,7 +130,7 @@ class GpuPool:
 
     @property
     def host(self) -> CellPool:
-        """The blocks in the processor's memory, copied when they are first asked for after a change."""
+        """The blocks in the processor's memory, copied on first use after a change."""
         if self._host is None:
             self._host = CellPool(self._rules)
             self._host.put(from_gpu(self._coords, self._used), from_gpu(self._values, self._used))
@@ -137,13 +138,13 @@ class GpuPool:
 
     @property
     def on_gpu(self) -> StoredCells:
-        """What kernels for the card that only read need; holds until the pool changes."""
+        """The pool for read-only kernels on the card; valid until the pool changes."""
         unknown = np.int32(self._rules.format.unknown)
         return StoredCells(self._table, self._coords, self._values, unknown, self._rules.lowest)
 
     @property
     def stored_cells(self) -> StoredCells:
-        """What the processor's kernels that only read need; holds until the pool changes."""
+        """The pool for the processor's read-only kernels; valid until the pool changes."""
         return self.host.stored_cells
 
     @property
@@ -158,7 +159,7 @@ class GpuPool:
         return self._values.nbytes + self._coords.nbytes + self._table.nbytes
 
     def put(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; earlier content is lost."""
         host = self.host
         host.put(coords, cells)
         self._fill(host)
@@ -170,13 +171,13 @@ class GpuPool:
         return self.host.within(low, high)
 
     def pieces(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield coordinates (n, 3) and cells (n, 512) of all blocks as they are now, in ascending order."""
+        """Yield coordinates (n, 3) and cells (n, 512) of all current blocks, in ascending order."""
         yield from self.host.pieces()
 
     def make_room(self, evidence: GpuEvidence) -> None:
         """Make room for the blocks of evidence.
 
-        Raises FrameRefused `memory_full`, and changes nothing, where the card has none.
+        Raises FrameRefused `memory_full`, and changes nothing, if the card has none.
         """
         sizes = evidence.n, evidence.m
         try:
@@ -187,7 +188,7 @@ class GpuPool:
             if self._used + sum(sizes) > len(self._coords):
                 self._find(evidence)
                 missing = int(self._counts.copy_to_host()[_gpu.MISSING])
-                self._set_used(self._used)  # what was counted for this evidence
+                self._set_used(self._used)  # undo the count for this evidence
                 self._reserve(missing)
         except MemoryError:
             raise FrameRefused(
@@ -215,7 +216,7 @@ class GpuPool:
         return int(counts[_gpu.CHANGED])
 
     def _find(self, evidence: GpuEvidence) -> None:
-        """Write to `_places` if the blocks of evidence are, and count those that are missing."""
+        """Write the places of the evidence's blocks to `_places`, and count the missing ones."""
         (coords, _, said, uniform, steps), n, m = evidence.arrays, evidence.n, evidence.m
         for places, wanted, given, size in zip(self._places, (coords, uniform), (said, steps), (n, m), strict=True):
             launch(_gpu.find_places, self._table, self._coords, wanted, given, size, places, self._counts)
@@ -230,7 +231,7 @@ class GpuPool:
         return table, gpu_array((rows, 3), np.int32), values
 
     def _reserve(self, more: int) -> None:
-        """Make room for so many more rows; all keep their place. Raises MemoryError, and changes nothing."""
+        """Make room for this many more rows; all keep their place. Raises MemoryError, and changes nothing."""
         if self._used + more <= len(self._coords):
             return
         table, coords, values = self._arrays(int(GROWTH * (self._used + more)))
@@ -240,7 +241,7 @@ class GpuPool:
         self._table, self._coords, self._values = table, coords, values
 
     def _fill(self, host: CellPool) -> None:
-        """Hold the blocks of `host` and no others."""
+        """Replace all blocks with the blocks of `host`."""
         coords, cells = host.get(host.block_coords)
         self._table, self._coords, self._values = self._arrays(max(ROOM, int(GROWTH * len(coords))))
         if len(coords):
@@ -252,7 +253,7 @@ class GpuPool:
 
 
 class GpuStorage(Storage):
-    """The blocks of a map without bounds, on a graphics card. Raises MemoryError where not even an empty one fits."""
+    """The blocks of a map without bounds, on a graphics card. Raises MemoryError if not even an empty one fits."""
 
     _pool: GpuPool  # pyright: ignore[reportIncompatibleVariableOverride] - set once
 
@@ -261,11 +262,11 @@ class GpuStorage(Storage):
         self._pool = GpuPool(self.rules, ROOM)
 
     def check_room(self, evidence: Evidence) -> None:
-        """Make room on the card for all that `evidence` is about; raises FrameRefused `memory_full`."""
+        """Make room on the card for all blocks of `evidence`; raises FrameRefused `memory_full`."""
         self._pool.make_room(GpuEvidence.of(evidence))
 
     def agreement(self, evidence: Evidence, firm: int) -> Agreement:
-        """Return how far `evidence` agrees with what the map is sure of; see `Storage.agreement`."""
+        """Return how far `evidence` agrees with certain cells of the map; see `Storage.agreement`."""
         mine, stored, sure = GpuEvidence.of(evidence), self._pool.on_gpu, self.rules.sure
 
         def weigh(least: np.int16, mask: np.uint32) -> NDArray[np.float64]:
@@ -300,7 +301,7 @@ class GpuStorage(Storage):
 
 
 def gpu_map(config: Config, resume: VoxelMap | None) -> VoxelMap:
-    """Return a map on the card, with the cells and the history of `resume`; that itself where it is there already.
+    """Return a map on the card, with the cells and the history of `resume`; `resume` itself if it is already there.
 
     Raises ConfigError without a card.
     """

@@ -15,18 +15,18 @@ from stereovox.maps.storage.tiles import TILE, WAITING
 from stereovox.maps.storage.window import most_touched, size_in_cells
 
 MAX_BYTES = 8_000_000_000
-"""A window that would need more memory is taken for a mistake, unless `max_memory` allows it."""
+"""A window that needs more memory is treated as a mistake, unless `max_memory` allows it."""
 MAX_FORMATTED = 10**24
-"""Larger numbers of bytes are written as this one: a whole number may be larger than any float."""
+"""Larger numbers of bytes are shown as this one: an integer may exceed any float."""
 UNITS = (1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
 MAX_BLOCKS = 1 << 29
-"""Places of blocks are kept in 32 bits, those with numbers and those without one after the other."""
+"""Places of blocks take 32 bits, with blocks that have numbers before those without."""
 COORDS = 3 * 4
 """Bytes of a block's coordinates."""
 
 
 def pool_bytes(config: Config, blocks: int) -> int:
-    """Return the bytes of a pool with room for so many blocks, each with numbers or without, and of their times."""
+    """Return the bytes of a pool with room for `blocks` blocks, with numbers or without, and of their times."""
     cells = blocks * (CELLS * FORMATS[config.map.cell].dtype.itemsize + 2 * COORDS) + 4 * table_size(2 * blocks)
     return cells + (blocks * (4 * CELLS + COORDS) + 4 * table_size(blocks) if config.map.keep_times else 0)
 
@@ -41,7 +41,7 @@ def most_blocks(config: Config) -> int:
 
 
 def window_blocks(config: Config) -> int:
-    """Return how many blocks the window touches at most, with those that its tiles on disk have next to it."""
+    """Return the most blocks the window touches, including those of its disk tiles next to it."""
     assert config.window.size is not None
     unit = TILE if config.window.outside == "keep" else SIDE
     return (
@@ -51,11 +51,11 @@ def window_blocks(config: Config) -> int:
 
 
 def within_memory(config: Config) -> Config:
-    """Return the settings with the window that `max_memory` and `when_full` make; as they are if none is asked for.
+    """Return the settings with the window that `max_memory` and `when_full` imply; unchanged if there is none.
 
-    A window that is not given is the largest that fits, about half as high as wide. Raises ConfigError, one line
-    with the cure, for one that does not fit, and where not even the view does: that of a camera at the border of the
-    trigger box, `max_range` to all sides and half as far up and down.
+    If no window is given, it is the largest that fits, about half as high as wide. Raises ConfigError, one line with
+    the cure, for one that does not fit, or if not even the view fits: that of a camera at the border of the trigger
+    box, `max_range` to all sides and half as far up and down.
     """
     allowed = int(config.max_memory or 0)
     if not allowed or (config.window.size is None and config.when_full == "refuse"):
@@ -77,7 +77,7 @@ def format_bytes(number_of_bytes: float) -> str:
 
 
 def _format_at_least(number_of_bytes: int) -> str:
-    """Return at least this number of bytes as text, so that who sets just what it says has enough."""
+    """Return at least this number of bytes as text, so that setting the printed value suffices."""
     number = min(number_of_bytes, int(MAX_FORMATTED))
     size, unit = next(((int(size), unit) for size, unit in UNITS if number >= size), (1, "bytes"))
     part = 1 if number >= 10 * size or size == 1 else 10
@@ -94,14 +94,14 @@ def _widest(config: Config) -> float:
         needed = _window_bytes(_as_wide(config, step * -(-least // step)))
         raise ConfigError(
             f"max_memory {format_bytes(config.max_memory or 0)}: "
-            f"a window that holds the view needs {_format_at_least(needed)}; "
+            f"a window that covers the view needs {_format_at_least(needed)}; "
             "allow more, or set a smaller max_range or larger cells"
         )
     return width
 
 
 def _as_wide(config: Config, width: float) -> Config:
-    """Return the settings with a window of this width, and half as high next to the way that the trigger box leaves."""
+    """Return the settings with a window of this width, and half as high, plus the margin of the trigger box."""
     up = "xyz".index(config.up[-1])
     size = tuple(width / 2 + config.window.trigger if axis == up else width for axis in range(3))
     return _with_window(config, size=size, largest=None)
@@ -132,7 +132,7 @@ def _check(config: Config, most: int, cure: str) -> None:
 
 
 def _largest(fits: Callable[[int], bool], most: int) -> int:
-    """Return the largest number up to `most` that fits, where all smaller ones do; 0 where none does."""
+    """Return the largest number up to `most` that fits, given that smaller ones do; 0 if none does."""
     low, high = 0, most
     while low < high:
         middle = (low + high + 1) // 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map in a window that moves with the camera: bounded memory, the far past dropped or kept in tiles on disk."""
+"""A map in a window that moves with the camera: bounded memory, with cells outside dropped or kept in tiles on disk."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from stereovox.maps.storage.window import Box, Window, coarser, without
 from stereovox.maps.voxel_map import VoxelMap
 
 TIMES = CellFormat(np.dtype(np.uint32), NEVER, 1.0)
-"""How tiles hold the times of cells."""
+"""Format of cell times in tiles."""
 
 
 class RollingStorage(Storage):
-    """The blocks of a window that moves with the camera, and tiles on disk for what left it; see `RollingMap`.
+    """The blocks of a window that moves with the camera, and tiles on disk for cells that left it; see `RollingMap`.
 
-    All memory of the window is taken at the start: `memory_bytes` never changes. Up to `tiles.WAITING` tiles that wait
-    for the disk come on top, and the map that another run left until the first frame places the window.
+    All memory of the window is allocated at the start: `memory_bytes` never changes. Extra are up to `tiles.WAITING`
+    tiles that wait for the disk, and, until the first frame places the window, the map of an earlier run.
     """
 
     bounded = True
 
     def __init__(self, config: Config, tiles: Path | None = None):
         super().__init__(config)
-        self._settings = within_memory(config)  # those of the window; `config` may leave it to the memory
+        self._settings = within_memory(config)  # the window's; `config` may derive it from memory
         self._window = Window(self._settings)
         capacity = window_blocks(self._settings)
         self._pool = CellPool(self.rules, capacity, capacity)
         self._times = CellTimes(config.map, capacity) if config.map.keep_times else None
         self._earlier: Storage | None = None
         self._store = self._times_store = None
-        self._turned: list[int] = []  # stamps between which the clock was set back
-        self._since: dict[Tile, int] = {}  # how many of them there were when a tile was put to the disk
+        self._turned: list[int] = []  # stamps at which the clock was set back
+        self._since: dict[Tile, int] = {}  # their number when a tile was written to disk
         if self._settings.window.outside == "keep":  # last: they leave folders
             self._store = TileStore(self.cell_format, tiles)
             self._times_store = self._store_of_times(self._store.folder / INNER)
@@ -66,20 +66,19 @@ class RollingStorage(Storage):
 
     @property
     def tile_store(self) -> TileStore | None:
-        """Where cells outside the window are kept, if they are."""
+        """The store of cells outside the window, if they are kept."""
         return self._store
 
     @property
     def stored_cells(self) -> StoredCells:
-        """What kernels that only read need: the window, or the map made before until it is placed."""
+        """The cells for read-only kernels: the window, or before it is placed the earlier map."""
         return super().stored_cells if self._earlier is None else self._earlier.stored_cells
 
     def go_on_with(self, earlier: Storage) -> None:
-        """Start from the cells of a map made before; they enter when the window is placed, and are the map till then.
+        """Start from the cells of an earlier map; they enter once the window is placed, and are the map until then.
 
-        A window with the same settings goes on where it was; any other is placed by the first frame.
-        Raises ConfigError when the cells would get another meaning, and when what the map says of its window cannot be
-        understood.
+        A window with the same settings continues where it was; any other is placed by the first frame. Raises
+        ConfigError if the cells' meaning would change, or the map's record of its window is invalid.
         """
         earlier.check_cells(self.config)
         self.take_history(earlier)
@@ -94,7 +93,7 @@ class RollingStorage(Storage):
             self._rehearse()
 
     def replace_contents(self, other: Storage) -> None:
-        """Take over all cells, the window and the tiles of a map of the same settings, not to be used any more."""
+        """Take over all cells, the window and the tiles of a map of the same settings, which must no longer be used."""
         assert isinstance(other, RollingStorage)
         self.close()
         super().replace_contents(other)
@@ -102,9 +101,9 @@ class RollingStorage(Storage):
         self._store, self._times_store = other._store, other._times_store
 
     def set_viewpoint(self, viewpoint: Viewpoint) -> None:
-        """Remember where the camera stands and move the window after it.
+        """Record the camera's pose and move the window after it.
 
-        Raises MapFileError, and changes nothing, where an earlier tile could not be written.
+        Raises MapFileError, and changes nothing, if an earlier tile could not be written.
         """
         for store in (self._store, self._times_store):
             if store is not None:
@@ -123,11 +122,11 @@ class RollingStorage(Storage):
             self._move(before, now)
 
     def add(self, evidence: Evidence) -> int:
-        """Add what one frame says about the cells of the window; return the number of cells whose value changed."""
+        """Add one frame's evidence on cells of the window; return the number of cells whose value changed."""
         return super().add(self._within(evidence))
 
     def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Return the times (n, 512) of the cells of blocks (n, 3), wherever they are kept."""
+        """Return the times (n, 512) of the cells of blocks (n, 3), in memory or on disk."""
         if self._earlier is not None:
             return self._earlier.times_of(coords)
         times = super().times_of(coords)
@@ -145,14 +144,14 @@ class RollingStorage(Storage):
         return super().times_start_ns if self._earlier is None else self._earlier.times_start_ns
 
     def close(self) -> None:
-        """Remove the tiles on disk; save the map before."""
+        """Remove the tiles on disk; save the map first."""
         for store in (self._times_store, self._store):
             if store is not None:
                 store.close()
 
     def _slabs(self) -> Iterator[Blocks]:
-        """Yield all blocks, those on disk with them, piece by piece in ascending order."""
-        if self._earlier is not None:  # no frame has placed the window so far
+        """Yield all blocks, also those on disk, piece by piece in ascending order."""
+        if self._earlier is not None:  # no frame has placed the window yet
             yield from self._earlier.slabs()
             return
         if self._store is None:
@@ -176,7 +175,7 @@ class RollingStorage(Storage):
         return self._kept(tile)[:2]
 
     def stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
-        """Return the stored numbers (N,) of the cells at points (N, 3), wherever they are kept."""
+        """Return the stored numbers (N,) of the cells at points (N, 3), in memory or on disk."""
         if self._earlier is not None:
             return self._earlier.stored_at(points)
         stored = super().stored_at(points)
@@ -185,7 +184,7 @@ class RollingStorage(Storage):
         return stored
 
     def _look_into_tiles(self, points: NDArray[np.floating], stored: NDArray[np.integer]) -> None:
-        """Set what the window does not know and a tile does, tile by tile."""
+        """Fill in cells unknown in the window from tiles, tile by tile."""
         assert self._store is not None
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
         asked = np.flatnonzero(within & (stored == self.cell_format.unknown))
@@ -203,7 +202,7 @@ class RollingStorage(Storage):
                 stored[asked[group]] = found
 
     def _in_window(self, tile: Tile) -> bool:
-        """Tell whether the window touches a tile; what the disk says of it is then out of date."""
+        """Return whether the window touches a tile; its copy on disk is then out of date."""
         if self._window.box is None:
             return False
         low, high = coarser(self._window.box, TILE)
@@ -233,7 +232,7 @@ class RollingStorage(Storage):
             self._bring_back(tile)
 
     def _rehearse(self) -> None:
-        """Do all that a move does, with nothing: so its kernels are compiled before the first one."""
+        """Perform an empty move, so that its kernels are compiled before the first real one."""
         assert self._window.box is not None
         if self._store is None:
             low = self._window.box[0]
@@ -270,7 +269,7 @@ class RollingStorage(Storage):
     def _keep(
         self, tile: Tile, coords: NDArray[np.int32], cells: NDArray[np.integer], times: NDArray[np.uint32] | None
     ) -> None:
-        """Put blocks of a tile to the disk, with the times of their cells."""
+        """Write blocks of a tile to disk, with the times of their cells."""
         if self._store is not None:
             self._store.put(tile, coords, cells)
         if self._times_store is not None and times is not None:
@@ -278,7 +277,7 @@ class RollingStorage(Storage):
             self._since[tile] = len(self._turned)
 
     def _kept(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32] | None]:
-        """Return the blocks of a tile on disk and the times of their cells; what is over by now is unknown."""
+        """Return the blocks of a tile on disk and the times of their cells; expired cells are unknown."""
         assert self._store is not None
         coords, cells = self._store.get(tile)
         if self._times_store is None:
@@ -295,13 +294,13 @@ class RollingStorage(Storage):
             self._turned += before_ns, now_ns
 
     def _over(self, tile: Tile, times: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """Tell which times of cells in a tile are over, or were since it left: a clock that is set back brings none."""
+        """Return which cell times of a tile expired, now or since it left: a clock set back revives none."""
         assert self._times is not None
         moments = self._now_ns, *self._turned[self._since[tile] :]
         return self._times.expired(times, min(moments)) | self._times.expired(times, max(moments))
 
     def _store_of_times(self, folder: Path) -> TileStore | None:
-        """Return the tiles that keep when cells were seen."""
+        """Return the tiles that keep cell times."""
         if self._times is None:
             return None
         try:
@@ -311,7 +310,7 @@ class RollingStorage(Storage):
             raise
 
     def _take_over(self) -> None:
-        """Put the cells of an earlier map where they belong: into the window, or to the tiles, or nowhere."""
+        """Distribute the cells of an earlier map: into the window, into the tiles, or nowhere."""
         if self._earlier is None or self._window.box is None:
             return
         earlier, self._earlier = self._earlier, None
@@ -351,9 +350,9 @@ class RollingMap(VoxelMap):
     """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
 
     With `window.outside = "drop"` cells that leave become unknown; with "keep" they go to tiles on disk (`tiles`: the
-    folder, a temporary one by default) and come back with the window. All memory of the window is taken at the start:
-    `memory_bytes` never changes. Queries are answered wherever a cell lies; cells in tiles are read from the disk,
-    which is slow. `close` removes the tiles.
+    folder, a temporary one by default) and return with the window. All memory of the window is allocated at the start:
+    `memory_bytes` never changes. Queries work anywhere; cells in tiles are read from disk, which is slow. `close`
+    removes the tiles.
     """
 
     storage: RollingStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
@@ -368,7 +367,7 @@ class RollingMap(VoxelMap):
 
 
 def _window_of(config: Config) -> WindowConfig:
-    """Return the window that a map was made in with these settings; as they stand where they no longer make one."""
+    """Return the window of a map made with these settings; the setting itself if they no longer give one."""
     try:
         return within_memory(config).window
     except ConfigError:

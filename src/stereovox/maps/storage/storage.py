@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Storage of a voxel map: its blocks, the times of their cells, its settings and history.
 
-`VoxelMap` answers its users from it; whatever reads or writes whole blocks uses it as `voxel_map.storage`.
+`VoxelMap` answers queries from it; code that reads or writes whole blocks uses `voxel_map.storage`.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from stereovox.maps.storage.blocks import CELLS, SIDE, StoredCells, blocks_of_ce
 from stereovox.maps.storage.tiles import TileStore
 
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
-"""Lowest block that `Storage.blocks_within` may be asked for, and the first beyond the highest."""
+"""Lowest block allowed in `Storage.blocks_within`, and the first beyond the highest."""
 
 NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms", "amcl", "slam", "loops"}
-"""Settings that do not change what a frame that was taken says; `map` is compared by itself."""
+"""Settings that do not change the evidence of past frames; `map` is compared separately."""
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
-"""Block coordinates (n, 3), and their cells (n, 512) as they are stored."""
+"""Block coordinates (n, 3), and their cells (n, 512) as stored."""
 
 
 def settings_of_frames(config: Config) -> list[str]:
-    """Return the names of the settings, but for `map`, that say what a frame means that was taken."""
+    """Return the names of the settings, except `map`, that determine the evidence of past frames."""
     return [name for name in type(config).model_fields if name not in NOT_OF_FRAMES]
 
 
 class OnStorage(WithHistory):
-    """Attributes of a map that its storage keeps; like plain attributes they are read without the lock."""
+    """Attributes of a map kept in its storage; like plain attributes they are read without the lock."""
 
     storage: Any
 
@@ -61,7 +61,7 @@ class OnStorage(WithHistory):
 
     @property
     def history(self) -> History:
-        """What the map remembers of its frames."""
+        """The map's record of its frames."""
         return self.storage.history
 
     @history.setter
@@ -73,16 +73,16 @@ class Storage(Guarded):
     """The blocks of a map without bounds, in memory.
 
     Attributes:
-        lock: Held by each call, and by those of the map.
+        lock: Held during each call, and each call of the map.
         config: The settings.
-        history: What the map remembers of its frames.
-        viewpoint: Where the camera stood last; None before the first frame.
+        history: The map's record of its frames.
+        viewpoint: Last camera pose; None before the first frame.
         window_state: Where the window was, for a map that has or had one.
-        listeners: Called with the evidence after every `add`, the lock held. No other block has changed, but for those
-            that a window or time took away. After a correction of poses with `uniform` evidence of 0 on all blocks
-            that were made anew.
+        listeners: Called with the evidence after every `add`, the lock held. No other block has changed, except those
+            that a window or time removed. After a correction of poses they get `uniform` evidence of 0 on all rebuilt
+            blocks.
         kept: The depth images of all frames; None if they are not kept.
-        rules: What stored numbers mean.
+        rules: Meaning of stored numbers.
         cell_format: How log-odds are stored.
     """
 
@@ -104,9 +104,9 @@ class Storage(Guarded):
         self._times = CellTimes(config.map) if config.map.keep_times else None
 
     def check_cells(self, config: Config) -> None:
-        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section.
+        """Raise ConfigError if `config` gives cells another meaning: their size or the `map` section.
 
-        Where a map that kept its frames goes on keeping them, also when these would be mapped otherwise.
+        If a map continues to keep its frames, also if past frames would be mapped differently.
         """
         for name in ("voxel_size", "steps"):
             self._check_same(name, getattr(self.config, name), getattr(config, name))
@@ -122,7 +122,7 @@ class Storage(Guarded):
             raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
 
     def continue_with(self, config: Config) -> None:
-        """Take over the settings of a run that goes on with this map; raises ConfigError as `check_cells` does."""
+        """Adopt the settings of a run that continues this map; raises ConfigError as `check_cells` does."""
         self.check_cells(config)
         self.config = config
 
@@ -130,7 +130,7 @@ class Storage(Guarded):
         """Raise StereovoxError if nothing can be added to this map; here it can."""
 
     def take_history(self, earlier: Storage) -> None:
-        """Take over what `earlier` remembers of its frames."""
+        """Take over the frame record of `earlier`."""
         self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
 
     def fill(self, other: Storage, blocks: Iterable[Blocks]) -> None:
@@ -143,7 +143,7 @@ class Storage(Guarded):
 
     @property
     def tile_store(self) -> TileStore | None:
-        """Where cells outside a window are kept, if they are: nowhere here."""
+        """The store of cells outside a window, if they are kept: none here."""
         return None
 
     @property
@@ -163,14 +163,14 @@ class Storage(Guarded):
             self._times.put(found, other.times_of(found))
 
     def replace_contents(self, other: Storage) -> None:
-        """Take over all cells of a map of the same settings, which must not be used any more."""
+        """Take over all cells of a map of the same settings, which must no longer be used."""
         self._pool, self._times = other._pool, other._times
         self.viewpoint, self.window_state = other.viewpoint, other.window_state
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost.
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; earlier content is lost.
 
-        Raises StereovoxError for arrays of other shapes.
+        Raises StereovoxError for other shapes.
         """
         if coords.ndim != 2 or coords.shape[1] != 3 or cells.shape != (len(coords), CELLS):
             raise StereovoxError(f"blocks are {coords.shape} with cells {cells.shape}; give (n, 3) and (n, {CELLS})")
@@ -180,16 +180,16 @@ class Storage(Guarded):
             self._times.remove(coords)
 
     def set_viewpoint(self, viewpoint: Viewpoint) -> None:
-        """Set where the camera stands; a bounded map moves with it, cells without evidence for long are forgotten."""
+        """Set the camera's pose; a bounded map moves with it, and cells without evidence for too long are forgotten."""
         before, self.viewpoint = self.viewpoint, viewpoint
         if self._times is not None:
             self._times.forget(self._pool, (before or viewpoint).stamp_ns, viewpoint.stamp_ns)
 
     def check_room(self, evidence: Evidence) -> None:
-        """Do nothing: memory is not bounded here. Storage that is raises FrameRefused `memory_full`."""
+        """Do nothing: memory is unbounded here. Bounded storage raises FrameRefused `memory_full`."""
 
     def agreement(self, evidence: Evidence, firm: int) -> Agreement:
-        """Return how far `evidence` agrees with what the map is sure of.
+        """Return how far `evidence` agrees with certain cells of the map.
 
         firm: evidence of a hit, in thousandths, below which it may be noise.
         """
@@ -209,13 +209,13 @@ class Storage(Guarded):
 
     @property
     def stored_cells(self) -> StoredCells:
-        """What kernels that only read need; valid until the map changes."""
+        """The cells for read-only kernels; valid until the map changes."""
         return self._pool.stored_cells
 
     def cells_within(self, low: ArrayLike, high: ArrayLike) -> StoredCells:
-        """Return cells that hold those with indices (3,) from `low` to below `high`, as `stored_cells` does: all here.
+        """Return cells that include indices (3,) from `low` to below `high`, as `stored_cells`: here all of them.
 
-        For maps that are not all in memory, which read what is asked for.
+        Maps that are not wholly in memory read only these.
         """
         return self.stored_cells
 
@@ -228,14 +228,14 @@ class Storage(Guarded):
         return queries.stored_at(self.stored_cells, self.config.cell, points)
 
     def blocks(self) -> Blocks:
-        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
+        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as stored."""
         coords, values = zip(*self.slabs(), strict=True)
         return np.concatenate(coords), np.concatenate(values)
 
     def blocks_within(self, low: ArrayLike, high: ArrayLike) -> Blocks:
         """Return the blocks in memory with coordinates (3,) from `low` to below `high`, in no order.
 
-        Coordinates (n, 3), cells (n, 512) as they are stored; both are copies.
+        Coordinates (n, 3), cells (n, 512) as stored; both are copies.
         """
         return self._pool.within(np.asarray(low), np.asarray(high))
 
@@ -246,9 +246,9 @@ class Storage(Guarded):
             yield coords[inside], cells[inside]
 
     def slabs(self) -> Iterator[Blocks]:
-        """Yield all blocks as in `blocks`, piece by piece in ascending order; those of a map in boxes box by box.
+        """Yield all blocks as in `blocks`, piece by piece in ascending order; a map in boxes box by box.
 
-        If the map changes meanwhile, each piece is as it is at its time; hold `lock` to read one state.
+        If the map changes meanwhile, each piece is as of its reading; hold `lock` to read one state.
         """
         yield from in_steps(self.lock, self._slabs())
 
@@ -259,16 +259,16 @@ class Storage(Guarded):
     def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
         """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 if there is none.
 
-        Raises StereovoxError if the map keeps no times. What they mean: `CellTimes`.
+        Raises StereovoxError if the map keeps no times. See `CellTimes`.
         """
         yield from in_steps(self.lock, self._timed())
 
     def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Return the times (n, 512) of the cells of blocks (n, 3); they mean something where the cell is known."""
+        """Return the times (n, 512) of the cells of blocks (n, 3); valid if the cell is known."""
         return self._kept_times.get(coords)
 
     def times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
-        """Return the times (N,) of the cells at points (N, 3), NEVER where no cell can be."""
+        """Return the times (N,) of the cells at points (N, 3), NEVER outside the index range."""
         times = np.zeros(len(points), np.uint32)
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
         cells = np.floor(points[within] / self.config.cell).astype(np.int64)
@@ -278,11 +278,11 @@ class Storage(Guarded):
         return times
 
     def seconds_ago(self, times: NDArray[np.uint32], now_ns: int | None) -> NDArray[np.float32]:
-        """Return how long before `now_ns` (None: the last frame) times are, in seconds; NaN for NEVER."""
+        """Return ages at `now_ns` (None: the last frame) in seconds; NaN for NEVER."""
         return self._kept_times.seconds_ago(times, self._now_ns if now_ns is None else now_ns)
 
     def set_times(self, coords: NDArray[np.int32], times: NDArray[np.uint32], start_ns: int | None) -> None:
-        """Set the times (n, 512) of blocks (n, 3) that are in the map; they count from `start_ns`."""
+        """Set the times (n, 512) of blocks (n, 3) that are in the map, counted from `start_ns`."""
         self._kept_times.put(coords, times)
         self._kept_times.start_ns = start_ns
 
@@ -298,14 +298,14 @@ class Storage(Guarded):
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes allocated: those in use, and room to grow (which the system gives when it is first used)."""
+        """Bytes allocated: in use, and room to grow (which the system provides on first use)."""
         return self._pool.reserved_bytes + (0 if self._times is None else self._times.reserved_bytes)
 
     def close(self) -> None:
         """Remove what is on disk (nothing, unless a window keeps tiles there)."""
 
     def _slabs(self) -> Iterator[Blocks]:
-        """Yield what `slabs` does; the lock is held while an item is made."""
+        """Yield what `slabs` does; the lock is held while an item is produced."""
         yield from self._pool.pieces()
 
     def _timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells that left a window, in tiles on disk: one Zarr v3 array without practical bounds, one tile a chunk.
 
-A background thread writes, so that mapping does not wait for the disk; what is still to be written is bounded.
+A background thread writes, so that mapping does not wait for the disk; pending writes are bounded.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ BLOCKS = 4
 TILE = BLOCKS * SIDE
 """Cells along each side of a tile."""
 OFFSET = 1 << 30
-"""Cell 0 stands here in the array: Zarr knows no negative indices."""
+"""Index of cell 0 in the array: Zarr has no negative indices."""
 WAITING = 128
-"""Tiles that may wait to be written; one more and mapping waits."""
+"""Most tiles that wait to be written; with one more, mapping waits."""
 
 DAMAGED = "the map of this run is damaged, make it again on a disk that works"
 
 INNER = "times"
-"""Folder for another store of the same tiles; whoever removes this one's folder removes it as well."""
+"""Folder for another store of the same tiles; removing this one's folder removes it too."""
 OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|{INNER}|.*\.partial")
-"""What a store has in its folder."""
+"""Names in a store's folder."""
 
 Tile = tuple[int, int, int]
 
@@ -47,8 +47,8 @@ Tile = tuple[int, int, int]
 class TileStore:
     """Tiles of 32x32x32 cells by their coordinates (cell index // 32).
 
-    folder: it must be empty or not exist or hold what a run left that was killed; `close` removes it. By default a
-    temporary one that goes with this object. Raises MapFileError if the folder cannot be used, or another run does.
+    folder: it must be empty, missing, or hold the remains of a killed run; `close` removes it. By default a temporary
+    one that is removed with this object. Raises MapFileError if the folder is unusable, or in use by another run.
     """
 
     def __init__(self, cell_format: CellFormat, folder: Path | None = None):
@@ -56,7 +56,7 @@ class TileStore:
         self.folder = Path(tempfile.mkdtemp(prefix="stereovox-tiles-")) if folder is None else folder
         self._writing = ExitStack()
         self._array = self._create()
-        self._tiles: dict[Tile, int] = {}  # with the checksum of what each holds
+        self._tiles: dict[Tile, int] = {}  # with the checksum of each one's content
         self._waiting: dict[Tile, tuple[NDArray, Future[None]]] = {}
         self._failed: OSError | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="stereovox-tiles")
@@ -71,9 +71,9 @@ class TileStore:
         return sorted(self._tiles)
 
     def put(self, tile: Tile, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Store the blocks of one tile: block coordinates (n, 3), cells (n, 512). They replace what stood there.
+        """Store the blocks of one tile: block coordinates (n, 3), cells (n, 512). They replace earlier content.
 
-        A tile that cannot be written stays in memory, so that no cell is lost; `check` tells.
+        A tile that cannot be written stays in memory, so that no cell is lost; `check` reports it.
         """
         while len(self._waiting) >= WAITING and self._failed is None:
             self._settle(next(iter(self._waiting)))
@@ -91,23 +91,23 @@ class TileStore:
             raise MapFileError(f"{self.folder}: a tile cannot be written ({why}); choose a disk that has room")
 
     def get(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return the blocks of one tile that hold any known cell: coordinates (n, 3), cells (n, 512)."""
+        """Return the blocks of one tile that have any known cell: coordinates (n, 3), cells (n, 512)."""
         dense = self._dense(tile)
         known = (dense != self._format.unknown).any(axis=3)
         return np.argwhere(known).astype(np.int32) + np.multiply(tile, BLOCKS).astype(np.int32), dense[known]
 
     def blocks_at(self, tile: Tile, coords: NDArray[np.int32]) -> NDArray[np.integer]:
-        """Return the cells (n, 512) of blocks (n, 3) that lie in `tile`."""
+        """Return the cells (n, 512) of blocks (n, 3) in `tile`."""
         return self._dense(tile)[tuple((coords - np.multiply(tile, BLOCKS)).T)]
 
     def stored_at(self, tile: Tile, cells: NDArray[np.int64]) -> NDArray[np.integer]:
-        """Return the stored numbers (n,) of cells (n, 3) that lie in `tile`."""
+        """Return the stored numbers (n,) of cells (n, 3) in `tile`."""
         block, cell = np.divmod(cells - np.multiply(tile, TILE), SIDE)
         column = (cell[:, 0] * SIDE + cell[:, 1]) * SIDE + cell[:, 2]
         return self._dense(tile)[(*block.T, column)]
 
     def close(self) -> None:
-        """Remove the folder; what still waits to be written is not needed any more."""
+        """Remove the folder and drop pending writes."""
         self._writer.shutdown(wait=True, cancel_futures=True)
         self._remove()
 
@@ -133,7 +133,7 @@ class TileStore:
         )  # fmt: skip
 
     def _check_unused(self) -> None:
-        """Refuse a folder that holds anything but what another store left, or still uses."""
+        """Refuse a folder with anything but the remains of another store, or one in use."""
         try:
             names = {entry.name for entry in self.folder.iterdir()} if self.folder.exists() else set()
         except OSError as error:
@@ -142,7 +142,7 @@ class TileStore:
             raise MapFileError(f"{self.folder}: holds something that is not a tile; move it away")
 
     def _clear(self) -> None:
-        """Remove all but the lock: tiles of this store, or of one whose run was killed."""
+        """Remove all but the lock: tiles of this store or of a killed run."""
         for entry in self.folder.iterdir():
             if entry.name != LOCK:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
@@ -162,7 +162,7 @@ class TileStore:
         self._array[_place(tile)] = _to_cells(dense)
 
     def _read(self, tile: Tile) -> NDArray:
-        """Return what was written. Raises MapFileError if the disk does not hold it any more."""
+        """Return a written tile. Raises MapFileError if the disk has lost it."""
         try:
             dense = _to_blocks(np.asarray(self._array[_place(tile)]))
         except (OSError, ValueError, RuntimeError) as error:

@@ -13,21 +13,22 @@ Cell = tuple[int, int, int]
 Box = tuple[Cell, Cell]
 """Lowest cell, and the first cell beyond the highest, on each axis."""
 GROWTH = 8
-"""Cells by which the window grows and shrinks: so that a trembling speed does not make it breathe."""
+"""Step in cells by which the window grows and shrinks, so that jitter in speed does not resize it."""
 SMOOTHING_S = 0.3
 """Time over which the camera's velocity is averaged."""
 FURTHEST = 1 << 30
-"""No cell lies further out."""
+"""No cell is farther out."""
 JUMP_MPS = 60.0
-"""Faster than this nothing flies: the camera was carried, or its poses jumped; it then counts as standing still."""
+"""Nothing flies faster: the camera was carried, or its poses jumped; it then counts as standing still."""
 
 
 class Window:
-    """A box that moves by whole cells so that the camera stays within the trigger box about its centre, or stays fixed.
+    """A box that moves by whole cells so that the camera stays within the trigger box around its centre, or stays
+    fixed.
 
     The centre runs `lead_s` seconds of flight ahead of the camera, and the box is longer by `grow_s` seconds of flight
-    along each axis, up to `largest`. A trigger box smaller than a cell counts as one cell: the middle cannot come
-    nearer to the camera than half a cell, and would swing to and fro.
+    along each axis, up to `largest`. A trigger box smaller than a cell counts as one cell: the centre cannot get nearer
+    to the camera than half a cell, and would oscillate.
     """
 
     def __init__(self, config: Config):
@@ -54,16 +55,16 @@ class Window:
 
     @property
     def state(self) -> dict[str, Any] | None:
-        """What `restore` needs, as plain numbers; None before the first frame."""
+        """The state for `restore`, as plain numbers; None before the first frame."""
         if self.box is None or self._last is None:
             return None
         (position, stamp_ns), velocity = self._last, list(self._velocity)
         return {"box": [list(c) for c in self.box], "velocity": velocity, "position": position, "stamp_ns": stamp_ns}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on where another run was.
+        """Continue where another run ended.
 
-        Raises KeyError, TypeError, ValueError or OverflowError for what is no `state`, and changes nothing then.
+        Raises KeyError, TypeError, ValueError or OverflowError for an invalid `state`, and then changes nothing.
         """
         low, high = (_three(corner, int, FURTHEST) for corner in state["box"])
         extent = tuple(b - a for a, b in zip(low, high, strict=True))
@@ -115,7 +116,7 @@ class Window:
 
 
 def without(box: Box, other: Box) -> Iterator[Box]:
-    """Yield boxes, at most six and none twice the same cell, that hold what of `box` is not in `other`."""
+    """Yield at most six disjoint boxes that cover the part of `box` outside `other`."""
     low, high = list(box[0]), list(box[1])
     for axis in range(3):
         start, end = max(other[0][axis], low[axis]), min(other[1][axis], high[axis])
@@ -137,7 +138,7 @@ def coarser(box: Box, cells: int) -> Box:
 
 
 def most_touched(extent: Cell, cells: int) -> int:
-    """Return how many larger cells (`cells` along each side) a box of this extent touches at most, wherever it is."""
+    """Return how many larger cells (`cells` along each side) a box of this extent touches at most, at any position."""
     number = 1
     for n in extent:
         number *= (n - 2) // cells + 2 if n > 1 else 1
@@ -145,13 +146,13 @@ def most_touched(extent: Cell, cells: int) -> int:
 
 
 def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]:
-    """Return three finite numbers of this kind, none beyond +-most."""
+    """Return three finite numbers of this kind within +-most."""
     x, y, z = (kind(number) for number in numbers)
     if not all(isfinite(number) and abs(number) <= most for number in (x, y, z)):
-        raise ValueError(f"{list(numbers)} cannot be")
+        raise ValueError(f"{list(numbers)} is invalid")
     return x, y, z
 
 
 def size_in_cells(size: Sequence[float], cell: Sequence[float]) -> Cell:
-    """Return how many cells long a box of this size in metres is on each axis, one at least."""
+    """Return the length in cells of a box of this size in metres on each axis, at least one."""
     return tuple(max(1, floor(x / c + 0.5)) for x, c in zip(size, cell, strict=True))  # pyright: ignore

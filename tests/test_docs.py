@@ -104,6 +104,7 @@ def test_the_menu_of_the_site_names_every_page_once():
     assert len(pages) == len(set(pages)), pages
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_asks_no_other_host(tmp_path):
     pytest.importorskip("material", reason="needs pip install '.[docs]'")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]

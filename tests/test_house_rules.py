@@ -42,6 +42,7 @@ HABITS = {
 """Words of translated English, and how often they may occur in a thousand words of source and docs."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_house_rule(name):
     command = [sys.executable, "-m", *COMMANDS[name]]

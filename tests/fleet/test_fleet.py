@@ -420,6 +420,7 @@ def test_a_plan_looks_where_the_run_reads(s3, tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_killed_workers_change_nothing(tmp_path):
     """Two processes, of which one after another is killed while boxes are mapped; the nannies start new ones."""
     psutil = pytest.importorskip("psutil")

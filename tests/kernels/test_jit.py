@@ -26,23 +26,6 @@ from stereovox.kernels import _jit
 PACKAGE = Path(sv.__file__).parent
 fresh_cache_folder = _jit.cache_folder.__wrapped__
 ENVIRONMENT = ("STEREOVOX_CACHE", "XDG_CACHE_HOME", "HOME")
-ASK_THE_MAP = """
-import json
-import numpy as np
-from stereovox import VoxelMap, load_config
-from stereovox.kernels._jit import cache_folder
-from stereovox.maps.cells import _pool
-from stereovox.maps.query import _query
-
-voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[0, 0, 0], [9, -9, 3]], [2.0, -1.0])
-stats = [kernel.stats for kernel in (_pool.put, _query.look_up)]
-print(json.dumps({
-    "folder": str(cache_folder()),
-    "log_odds": voxel_map.log_odds([[0.5, 0.5, 0.5], [9.5, -8.5, 3.5], [5, 5, 5]]).tolist(),
-    "hits": sum(sum(s.cache_hits.values()) for s in stats),
-    "misses": sum(sum(s.cache_misses.values()) for s in stats),
-}))
-"""
 MAP_A_FRAME = """
 import json, pickle, sys
 import machine_code
@@ -72,7 +55,22 @@ ARITHMETIC = re.compile(
 
 In an xmm register they are no loop: without AVX-512 a single whole number of 64 bits is made a double in this way.
 """
-ASK_THE_PROBE = "from stereovox._probe import f; print(f(1))"
+PROBE_CELLS = "from stereovox.kernels._jit import cell\n\n\n@cell\ndef g(x):\n    return x + 1\n"
+PROBE = (
+    "from stereovox.kernels._jit import kernel\nfrom stereovox._probe_cells import g\n\n\n"
+    "@kernel\ndef f(x):\n    return 10 * g(x)\n"
+)
+ASK_THE_PROBE = """
+import json
+from stereovox._probe import f
+from stereovox.kernels._jit import cache_folder
+
+answer, count = f(1), lambda counts: sum(counts.values())
+print(json.dumps({
+    "folder": str(cache_folder()), "answer": answer,
+    "hits": count(f.stats.cache_hits), "misses": count(f.stats.cache_misses),
+}))
+"""
 
 
 def run(program, data=b"", **environment):
@@ -91,17 +89,19 @@ def a_file(tmp_path):
     return str(file)
 
 
-def test_a_second_process_compiles_nothing_again(tmp_path):
-    first, second = (run(ASK_THE_MAP, STEREOVOX_CACHE=str(tmp_path), HOME=str(tmp_path)) for _ in range(2))
-    assert first["log_odds"] == second["log_odds"] == [2, -1, 0]
-    assert (first["hits"], first["misses"]) == (0, 2)
-    assert (second["hits"], second["misses"]) == (2, 0)
+def test_a_second_process_compiles_nothing_again(tmp_path, probed_package):
+    where = {"PYTHONPATH": str(probed_package.parent), "STEREOVOX_CACHE": str(tmp_path), "HOME": str(tmp_path)}
+    first, second = (run(ASK_THE_PROBE, **where) for _ in range(2))
+    assert first["answer"] == second["answer"] == 20
+    assert (first["hits"], first["misses"]) == (0, 1)
+    assert (second["hits"], second["misses"]) == (1, 0)
     assert Path(first["folder"]).is_relative_to(tmp_path)
 
 
-def test_kernels_run_where_home_cannot_be_written(tmp_path, a_file):
-    answer = run(ASK_THE_MAP, HOME=a_file, XDG_CACHE_HOME=a_file, TMPDIR=str(tmp_path))
-    assert answer["log_odds"] == [2, -1, 0]
+def test_kernels_run_where_home_cannot_be_written(tmp_path, a_file, probed_package):
+    where = {"PYTHONPATH": str(probed_package.parent), "HOME": a_file, "XDG_CACHE_HOME": a_file}
+    answer = run(ASK_THE_PROBE, **where, TMPDIR=str(tmp_path))
+    assert answer["answer"] == 20
     assert Path(answer["folder"]).is_relative_to(tmp_path)
 
 
@@ -152,6 +152,14 @@ def copied_package(tmp_path):
     return copy
 
 
+@pytest.fixture
+def probed_package(copied_package):
+    """A copy with a kernel that compiles in no time, and calls a cell of another file."""
+    (copied_package / "_probe_cells.py").write_text(PROBE_CELLS)
+    (copied_package / "_probe.py").write_text(PROBE)
+    return copied_package
+
+
 def test_only_kernel_files_change_the_hash(monkeypatch, copied_package):
     here = _jit._source_hash()
     monkeypatch.setattr(_jit, "__file__", str(copied_package / "kernels/_jit.py"))
@@ -163,15 +171,11 @@ def test_only_kernel_files_change_the_hash(monkeypatch, copied_package):
         assert (_jit._source_hash() != before) == renews, file
 
 
-def test_a_change_in_a_called_file_reaches_the_cached_caller(tmp_path, copied_package):
-    cells = copied_package / "_probe_cells.py"
-    cells.write_text("from stereovox.kernels._jit import cell\n\n\n@cell\ndef g(x):\n    return x + 1\n")
-    caller = "from stereovox.kernels._jit import kernel\nfrom stereovox._probe_cells import g\n\n\n"
-    (copied_package / "_probe.py").write_text(f"{caller}@kernel\ndef f(x):\n    return 10 * g(x)\n")
-    where = {"PYTHONPATH": str(copied_package.parent), "STEREOVOX_CACHE": str(tmp_path / "cache")}
-    assert run(ASK_THE_PROBE, **where) == 20
-    cells.write_text(cells.read_text().replace("x + 1", "x + 2"))
-    assert run(ASK_THE_PROBE, **where) == 30
+def test_a_change_in_a_called_file_reaches_the_cached_caller(tmp_path, probed_package):
+    where = {"PYTHONPATH": str(probed_package.parent), "STEREOVOX_CACHE": str(tmp_path / "cache")}
+    assert run(ASK_THE_PROBE, **where)["answer"] == 20
+    (probed_package / "_probe_cells.py").write_text(PROBE_CELLS.replace("x + 1", "x + 2"))
+    assert run(ASK_THE_PROBE, **where)["answer"] == 30
 
 
 def test_kernels_see_nan_and_infinity():
@@ -278,6 +282,7 @@ def test_rows_of_numbers_use_the_widest_vectors(monkeypatch):
     assert "zmm" in assembly(double)
 
 
+@pytest.mark.slow
 def test_kernels_for_any_processor_compute_in_float32_and_make_the_same_map(tmp_path):
     """An int32 times a float32 is a float64 in numba: easily written, never seen, and twice as slow."""
     frame, mapper = next(iter(sv.open_source("sim:room", "0:1"))), sv.Mapper(voxel_size=0.1)

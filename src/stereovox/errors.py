@@ -9,13 +9,13 @@ import re
 from collections.abc import Iterable
 
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Numbers of the errors of a file that has no room to grow: the disk, a quota or a limit is reached."""
+"""Error numbers of a file that has no room to grow: the disk, a quota or a limit is reached."""
 MAX_WORD_LENGTH = 100
-"""Characters of a word that are compared; words from a file may be longer."""
+"""Most characters of a word that are compared; words from a file may be longer."""
 MAX_LINE_LENGTH = 10_000
-"""Characters of a message."""
+"""Most characters of a message."""
 MAX_PRINTED, MAX_SHOWN = 289, 100
-"""Characters of a message that a command prints (a line of 300 with its name), and of a path in one that is longer."""
+"""Most characters of a printed message (a line of 300 with the command's name), and of a path in a longer one."""
 
 
 class StereovoxError(ValueError):
@@ -40,7 +40,7 @@ class SourceError(StereovoxError):
 
 
 class NoPoses(SourceError):  # noqa: N818 - reads as what happened
-    """A recording has images that can be used, but nothing in it says where they were taken."""
+    """A recording has usable images, but no poses."""
 
 
 class MapFileError(StereovoxError):
@@ -58,7 +58,7 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
     """A frame cannot be trusted and must not change the map.
 
     Attributes:
-        reason: Short fixed word that refusals are counted by (`pose_not_rigid`); the message has the details.
+        reason: Short fixed word by which refusals are counted (`pose_not_rigid`); the message has the details.
     """
 
     def __init__(self, reason: str, message: str):
@@ -67,7 +67,7 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
 
 
 def without_name(error: Exception, name: object) -> str:
-    """Return what an error says, for a line that names what it is about already."""
+    """Return an error's message without the name, for a line that already has it."""
     return str(error).removeprefix(f"{name}: ")
 
 
@@ -89,7 +89,7 @@ def shortened(text: str, length: int = MAX_SHOWN) -> str:
 def printed(message: str, names: Iterable[str] = ()) -> str:
     """Return a message in at most MAX_PRINTED characters: long paths lose their middles first, the cure stays.
 
-    names: words that may hold spaces and stand in the message, such as the paths that a command was given.
+    names: words in the message that may contain spaces, such as a command's paths.
     """
     names = sorted({one_line(name) for name in names}, key=len, reverse=True)
     line = message

@@ -46,5 +46,5 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
 
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:
-    """Return all names registered in `room`, those of other packages first: their layouts are asked before ours."""
+    """Return all names registered in `room`, other packages' first: their layouts are tried before ours."""
     return list(dict.fromkeys([*sorted(entry.name for entry in entry_points(group=f"stereovox.{room}")), *builtin]))

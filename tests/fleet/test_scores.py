@@ -87,7 +87,7 @@ def test_the_table_is_kept_and_adds_up(made):
 
 
 def test_what_was_scored_is_not_scored_again(sequences, made, scheduler, monkeypatch):
-    with pytest.raises(MapFileError, match="there are scores already"):
+    with pytest.raises(MapFileError, match="there are already scores"):
         score_fleet(sequences, made.out, PROFILES, scheduler=scheduler, **SETTINGS)
     monkeypatch.setattr(scores, "score_recording", None)  # no task is left that would need it
     again = score_fleet(sequences, made.out, PROFILES, options=OPTIONS, scheduler=scheduler, resume=True, **SETTINGS)

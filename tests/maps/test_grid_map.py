@@ -166,7 +166,7 @@ def test_other_cells_cannot_be_gone_on_with():
     grid = OccupancyGrid(np.zeros((2, 2), np.int8), 0.05)
     with pytest.raises(ConfigError, match=r"cells of 0\.05 m, not 0\.1; set voxel_size to 0\.05"):
         GridMap.from_occupancy(grid, load_config(**EVEN))
-    with pytest.raises(ConfigError, match="cannot go on"):
+    with pytest.raises(ConfigError, match="cannot continue"):
         GridMap(load_config(**EVEN)).storage.continue_with(load_config(**{**EVEN, "grid.prior": 0.2}))
     ros = OccupancyGrid(np.zeros((2, 2), np.int8), float(np.float32(0.1)))  # messages hold 32 bits
     assert GridMap.from_occupancy(ros, load_config(**EVEN)).counts()["free"] == 4

@@ -187,7 +187,7 @@ def test_a_map_without_camera_says_so():
     one.viewpoint = None
     draw_view(one, "space", "a map", "-y")
     draw_view(one, "layer", "a map", "-y")
-    with pytest.raises(StereovoxError, match=r"does not know where its camera stood.*--eye=X,Y,Z --toward=X,Y,Z"):
+    with pytest.raises(StereovoxError, match=r"has no camera pose.*--eye=X,Y,Z --toward=X,Y,Z"):
         draw_view(one, "axis", "a map", "-y")
     with pytest.raises(StereovoxError, match="did you mean 'layer'"):
         draw_view(one, "layers", "a map", "-y")

@@ -54,7 +54,7 @@ def test_two_clicks_tell_a_distance_and_what_is_cut_off_is_not_met():
         measure.pick([0.1, -1, 5.1], [0, 1, 0])
         assert measure.text.content == FIRST
         measure.pick([3.1, 0.1, 9], [0, 0, -1])
-        assert measure.text.content == "**5.00 m** from middle to middle (x +3.00, y +0.00, z +4.00)"
+        assert measure.text.content == "**5.00 m** from centre to centre (x +3.00, y +0.00, z +4.00)"
         assert viewer.server.scene.get_handle_by_name("/measure/line") is not None
         measure.pick([3.1, 0.1, 9], [0, 0, -1])
         assert len(measure.picked) == 1

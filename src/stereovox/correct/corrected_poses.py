@@ -58,7 +58,7 @@ def load_with_frames(path: str | Path) -> tuple[VoxelMap, Sequence[KeptFrame]]:
     """Return a saved map and the frames it kept. Raises StereovoxError, which names the cure, if it kept none."""
     saved = load_map(path)
     if isinstance(saved, BoxedMap):
-        cure = "name better poses after the recording in the fleet's list, and go on with --resume"
+        cure = "name better poses after the recording in the fleet's list, and continue with --resume"
         raise StereovoxError(f"{path}: maps in boxes do not keep their frames; {cure}")
     return saved, need_frames(saved.kept_frames, f"{path}: the map").frames
 

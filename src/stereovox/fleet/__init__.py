@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings, one map, many machines: Dask runs the tasks, a folder or an object store holds what they make.
+"""Many recordings, one map, many machines: Dask runs the tasks, a folder or an object store holds the results.
 
-Space is divided, not time: what a cell holds depends on the frames that see it, in their order, and on nothing else.
-First each recording is mapped alone, which says which of its frames can be trusted; then each box of the world is
-mapped from all trusted frames that see it.
+Space is divided, not time: a cell's value depends only on the frames that see it, in their order. First each recording
+is mapped alone, which determines its trusted frames; then each box of the world is mapped from all trusted frames that
+see it.
 """
 
 from stereovox.fleet.fleet import FleetMap, map_fleet

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The boxes of a fleet's map: which frames each is made of, and the task that maps one."""
+"""The boxes of a fleet's map: the frames of each, and the task that maps one."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from stereovox.maps.storage.blocks import CELLS
 from stereovox.maps.storage.boxes import BOXES, BoxEntry, BoxLayout, Index, is_there, write_box
 
 DONE = "done"
-"""Folder of the entries of boxes that no manifest names yet, by what they are made of."""
+"""Folder of the entries of boxes that no manifest names yet, named by their inputs."""
 MAX_DONE = 1 << 20
-"""Bytes of one."""
+"""Most bytes of an entry."""
 
 
 class Piece(NamedTuple):
-    """Frames of one recording that see a box: its key, their numbers in it, and how many frames come before it."""
+    """Frames of one recording that see a box: its key, their indices in it, and the number of frames before it."""
 
     recording: str
     numbers: tuple[int, ...]
@@ -37,7 +37,7 @@ class Piece(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A box to be mapped: its index, pieces in the order of their frames, and from when times of cells count."""
+    """A box to be mapped: its index, pieces in the order of their frames, and the origin of cell times."""
 
     at: Index
     pieces: tuple[Piece, ...]
@@ -49,15 +49,15 @@ class Box(NamedTuple):
         return sum(len(piece.numbers) for piece in self.pieces)
 
     def inputs(self, layout: BoxLayout) -> str:
-        """Return a name made of all that the cells depend on; the keys of recordings hold the settings."""
+        """Return a name derived from all inputs of the cells; recordings' keys include the settings."""
         cells = layout.config.map
-        rounded = cells.cell != "int16"  # by the number of the frame, see `Storage`
+        rounded = cells.cell != "int16"  # depends on the frame's number, see `Storage`
         pieces = [(piece.recording, piece.numbers, piece.before if rounded else 0) for piece in self.pieces]
         return digest([self.at, layout.side, pieces, self.start_ns if cells.keep_times else None])
 
 
 class DoneBox(NamedTuple):
-    """A box that is mapped: its entry, None if no cell of it is known, and the seconds it took."""
+    """A mapped box: its entry, None if no cell of it is known, and the seconds it took."""
 
     entry: BoxEntry | None
     seconds: float
@@ -66,7 +66,7 @@ class DoneBox(NamedTuple):
 def boxes_of(recordings: Sequence[tuple[str, NDArray[np.int32], int]], start_ns: int | None) -> list[Box]:
     """Return the boxes that frames see.
 
-    recordings: key of each, which of its frames see which boxes, as `boxes_seen` returns it, and the number of frames.
+    recordings: for each its key, the boxes seen by its frames as from `boxes_seen`, and its number of frames.
     """
     found: dict[Index, list[Piece]] = {}
     before = 0
@@ -81,7 +81,7 @@ def boxes_of(recordings: Sequence[tuple[str, NDArray[np.int32], int]], start_ns:
 
 
 def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
-    """Map one box, write it, and then the entry that says so; a task of a worker.
+    """Map one box, write it, and then its entry; a worker's task.
 
     Raises MapFileError if a frame is damaged or the place cannot be written.
     """
@@ -104,9 +104,9 @@ def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
 
 
 class BoxesBefore:
-    """What runs before have left at a place and can be used: boxes whose files are there, whoever removed others.
+    """Usable boxes from earlier runs at a place: boxes whose files exist, whoever removed others.
 
-    A run that was killed, or a task that nobody waits for any more, may have left word of boxes that were swept.
+    A killed run, or an abandoned task, may have left entries of boxes that were swept.
     """
 
     def __init__(self, place: Place):
@@ -114,7 +114,7 @@ class BoxesBefore:
         self._manifest = None if place.find(MANIFEST) is None else read_boxed_manifest(place)
 
     def boxes(self, layout: BoxLayout, wanted: Iterable[str]) -> dict[str, DoneBox]:
-        """Return boxes by what they are made of, those of `wanted` that are there."""
+        """Return the existing boxes of `wanted`, by their inputs."""
         files = {file.rpartition("/")[2].removesuffix(".json") for file in self._place.names(f"{DONE}/")}
         named = self._named()
         found = {
@@ -129,7 +129,7 @@ class BoxesBefore:
         }
 
     def parents(self, layout: BoxLayout) -> dict[frozenset[str], BoxEntry | None]:
-        """Return boxes of the level above that of `layout` by the names of those they cover; None: no cell is known."""
+        """Return boxes of the level above `layout` by the names of boxes they cover; None: no cell is known."""
         if self._manifest is None or len(self._manifest.levels) <= layout.level:
             return {}
         level, above = [self._manifest.boxes, *self._manifest.levels][layout.level :][:2]
@@ -138,7 +138,7 @@ class BoxesBefore:
         return {names: box for names, box in found.items() if box is None or is_there(coarser, box, self._sizes)}
 
     def _named(self) -> dict[str, DoneBox]:
-        """Return the boxes that the manifest names, by what they are made of."""
+        """Return the boxes that the manifest names, by their inputs."""
         if self._manifest is None:
             return {}
         entries = {entry.box: entry for entry in self._manifest.boxes}
@@ -155,13 +155,13 @@ def saved(done: DoneBox) -> list[object]:
 
 
 def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
-    """Return a saved box. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+    """Return a saved box. Raises KeyError, TypeError or ValueError for invalid values."""
     entry, seconds = values
     return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))  # pyright: ignore[reportArgumentType]
 
 
 def _done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:
-    """Return a box that a run before has mapped from the same frames, None if missing."""
+    """Return a box that an earlier run mapped from the same frames, None if missing."""
     data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
     try:
         return None if data is None else loaded(unsealed(data)["done"], layout)

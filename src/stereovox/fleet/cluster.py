@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the tasks of a fleet run: a Dask cluster, on this machine or any other."""
+"""The Dask cluster that runs a fleet's tasks, on this machine or any other."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from stereovox import __version__
 from stereovox.errors import MissingExtra, StereovoxError
 
 LOST_WORKERS = 20
-"""Workers that may be lost with the same task before it is given up."""
+"""Workers that may be lost on the same task before giving up."""
 RETRIES = 2
-"""Times that a task that fails is tried again, on another worker if there is one."""
+"""Retries of a failed task, on another worker if there is one."""
 SILENT = 60
-"""Above all levels of logging: while it closes, Dask logs tracebacks as critical. What fails is raised."""
+"""Above all logging levels: while closing, Dask logs tracebacks as critical. Failures are raised."""
 PATIENCE_S = 10
-"""How long a scheduler may take to answer."""
+"""Seconds a scheduler may take to answer."""
 
 
 class Cluster:
@@ -37,9 +37,9 @@ class Cluster:
         tasks: Mapping[str, tuple[Any, ...]],
         priority: Mapping[str, int] | None = None,
     ) -> Iterator[tuple[str, Any]]:
-        """Yield name and result of tasks as they end, those of high priority begun first. A failure cancels the others.
+        """Yield name and result of tasks as they end, starting high priorities first. A failure cancels the others.
 
-        Raises StereovoxError if a task fails, or cannot be done since its workers die or the scheduler is gone.
+        Raises StereovoxError if a task fails, or cannot be done because its workers die or the scheduler is gone.
         """
         from distributed import KilledWorker, as_completed
 
@@ -56,25 +56,27 @@ class Cluster:
         except KilledWorker as error:
             name = str(error.task).partition(f"{self._name}-")[2]
             raise StereovoxError(
-                f"the workers that had '{name}' died {LOST_WORKERS} times (too little memory?); what is done "
-                "stays, go on with --resume"
+                f"the workers that had '{name}' died {LOST_WORKERS} times (too little memory?); finished work "
+                "is kept, continue with --resume"
             ) from None
         except (OSError, TimeoutError) as error:
-            raise StereovoxError(f"the cluster is lost ({error}); what is done stays, go on with --resume") from None
+            raise StereovoxError(
+                f"the cluster is lost ({error}); finished work is kept, continue with --resume"
+            ) from None
         except Exception as error:
             if type(error).__name__ not in ("CancelledError", "FutureCancelledError", "CommClosedError"):
                 raise
-            raise StereovoxError("the scheduler is lost; what is done stays, go on with --resume") from None
+            raise StereovoxError("the scheduler is lost; finished work is kept, continue with --resume") from None
         finally:
             self._client.cancel(list(submitted), force=True)
 
 
 def _result(future: Any) -> Any:
-    """Return the result of a task that ended; raises StereovoxError for an error of its worker's system."""
+    """Return the result of a task that ended; raises StereovoxError for a system error of its worker."""
     if future.status == "error" and isinstance(error := future.exception(), OSError):
         where = f"{error.filename}: " if error.filename else ""
         raise StereovoxError(
-            f"a worker cannot go on ({where}{error.strerror or error}); what is done stays, go on with --resume"
+            f"a worker failed ({where}{error.strerror or error}); finished work is kept, continue with --resume"
         )
     return future.result()
 
@@ -83,7 +85,7 @@ def _result(future: Any) -> Any:
 def cluster(
     scheduler: str | None, workers: int | None, notify: Callable[[str], object] = lambda line: None
 ) -> Iterator[Cluster]:
-    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it.
+    """Yield a task runner: the cluster of a scheduler, or processes of this machine that end with it.
 
     notify: called with each line that a user should see. Raises StereovoxError if no scheduler answers or a worker
     has another stereovox, and for less than one worker; MissingExtra if Dask is not installed.
@@ -117,11 +119,11 @@ def cluster(
 
 
 def _check_workers(client: Any, scheduler: str, notify: Callable[[str], object]) -> None:
-    """Raise StereovoxError if a worker has not this stereovox: it would end at a task, which it cannot read."""
+    """Raise StereovoxError if a worker has another stereovox: it would die on a task that it cannot read."""
     versions = client.run(resolve_name, "stereovox.__version__", on_error="return")
     for worker, theirs in versions.items():
         theirs = "no stereovox" if isinstance(theirs, (ImportError, AttributeError)) else theirs
-        if isinstance(theirs, str) and theirs != __version__:  # else it has just gone
+        if isinstance(theirs, str) and theirs != __version__:  # else it has just left
             raise StereovoxError(f"{worker}: this worker has {theirs}, here is {__version__}; install the same on all")
     if not versions:
         notify(f"note: {scheduler} has no workers yet; waiting for some (dask worker {scheduler})")
@@ -129,11 +131,11 @@ def _check_workers(client: Any, scheduler: str, notify: Callable[[str], object])
 
 @contextmanager
 def _spared_ctrl_c() -> Iterator[None]:
-    """Keep Ctrl-C from the threads and processes that are begun here, and by these: who waits for them ends them."""
+    """Shield threads and processes started here, and by these, from Ctrl-C: their owner ends them."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # it would let Ctrl-C through again
+    resource_tracker.ensure_running()  # else it lets Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole of a fleet's run: index the recordings, map the boxes, coarsen them, and write the manifest last."""
+"""A fleet's whole run: index the recordings, map the boxes, coarsen them, and write the manifest last."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ from stereovox.runs.survey import PICTURES_UPRIGHT, survey
 
 MAX_SETTINGS = 1 << 20
 MAX_BOXES = 250_000
-"""That a manifest can name, with those of the levels and with what all are made of."""
+"""Most boxes that a manifest can name, with the levels' boxes and all inputs."""
 OVERLAP = 4.0
-"""Boxes that a frame shall be in at most, about."""
+"""Approximate upper bound on the boxes per frame."""
 Progress = Callable[[int, int, str], object]
 """Called with steps done, steps in all, and the current activity."""
 ONE_MACHINE = {"window.size": None, "max_memory": None, "deadline_ms": None, "map.forget_s": None}
@@ -66,12 +66,12 @@ class FleetMap:
     """Result of `map_fleet`.
 
     Attributes:
-        map: The map, opened without being loaded.
-        out: Where it is.
-        recordings: What each recording gave.
+        map: The map, opened without loading it.
+        out: Its location.
+        recordings: The report of each recording.
         boxes: Number of boxes, and how many of them were mapped by this run.
-        frames_read: How often a frame was mapped into a box, in all boxes.
-        seconds: Time of this run, and what its tasks took, all workers together.
+        frames_read: Number of times a frame was mapped into a box.
+        seconds: Time of this run, and of its tasks over all workers.
     """
 
     map: BoxedMap
@@ -83,11 +83,11 @@ class FleetMap:
 
     @property
     def overlap(self) -> float:
-        """In how many boxes a trusted frame is, on the average."""
+        """Average number of boxes of a trusted frame."""
         return self.frames_read / max(self.map.frames, 1)
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `stereovox fleet --json`, besides those of the map."""
+        """Return the numbers of `stereovox fleet --json`, except the map's."""
         broken: list[Any] = [f"{one.recording}: {one.error}" for one in self.recordings if one.error]
         broken += mostly_lost(self.map.frames, self.map.frames + self.map.frames_refused, "frames")
         return {
@@ -117,48 +117,49 @@ def map_fleet(
 ) -> FleetMap:
     """Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
 
-    Each recording is mapped alone first, by a mapper of its own, which decides which of its frames can be trusted. Then
-    each box of the world is mapped from all trusted frames that see it, in the order of the recordings. So the map does
-    not depend on the number of workers, the boxes or their order: of one recording it is that of `map_recording` with
-    the same settings, of several that of one mapper that gets the trusted frames one recording after the other.
+    Each recording is first mapped alone, by its own mapper, which decides which of its frames are trusted. Then each
+    box of the world is mapped from all trusted frames that see it, in the order of the recordings. So the map does not
+    depend on the number of workers, the boxes or their order: for one recording it equals the map of `map_recording`
+    with the same settings, for several the map of one mapper that gets the trusted frames recording by recording.
 
-    What is done stays: after a kill, a full disk or a lost scheduler the same call with `resume` does what is missing.
-    With other recordings, or other poses of some, it does what these change.
+
+    Finished work is kept: after a kill, a full disk or a lost scheduler the same call with `resume` completes the rest.
+    With other recordings, or other poses of some, it redoes only what these change.
 
     Args:
         recordings: See `recordings_of`. All workers must reach them under these names.
         out: Folder or URL (`s3://bucket/city.svox`) of the map, which all workers must reach.
-        profile: Profile name, TOML file or `Config`; None: with `resume` as before, else what the first recording
+        profile: Profile name, TOML file or `Config`; None: with `resume` as before, else as the first recording
             suggests.
-        box_m: Side of a box in metres; None: as before, else 256 cells, or 512 where frames reach far (`box_side`).
-        resume: Go on with a map that is there: it becomes the map of these recordings.
+        box_m: Side of a box in metres; None: as before, else 256 cells, or 512 if frames reach far (`box_side`).
+        resume: Continue an existing map: it becomes the map of these recordings.
         workers: Processes of a cluster of this machine; None: one for each core.
-        scheduler: Address of a Dask scheduler (`tcp://host:8786`) in place of that.
+        scheduler: Address of a Dask scheduler (`tcp://host:8786`) instead.
         progress: Called with steps done, steps in all, and the current activity.
         notify: Called with each line that a user should see.
         **overrides: Settings by name, as for `Mapper`.
 
     Returns:
-        The map, and what each recording gave; one that cannot be read is reported there and left out.
+        The map, and the report of each recording; an unreadable one is reported and left out.
 
     Raises:
-        StereovoxError: One line: not one frame could be used, a setting cannot be had in boxes, or the cluster failed.
-        MapFileError: Something else is at `out`, another run writes it, or it cannot be written.
+        StereovoxError: One line: no frame was usable, a setting is impossible in boxes, or the cluster failed.
+        MapFileError: Something else is at `out`, another run is writing it, or it cannot be written.
         MissingExtra: Dask or obstore is not installed.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; what is done stays.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; finished work is kept.
     """
     started, listed, place = perf_counter(), recordings_of(recordings), Place.of(out)
     check_boxed_target(place, (SETTINGS, f"{RECORDINGS}/", f"{DONE}/"))
     with ended_in_order(), only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
-        keys = {one: one.key(layout) for one in listed}  # once: files may change meanwhile
+        keys = {one: one.key(layout) for one in listed}  # once, because files may change meanwhile
         with cluster(scheduler, workers, notify) as run:
             place.write(SETTINGS, sealed(_settings(layout)))
             reports = _indexed(run, place, keys, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
                 if not place.names(f"{RECORDINGS}/") and place.find(MANIFEST) is None:
-                    place.remove([SETTINGS])  # the next run begins anew
+                    place.remove([SETTINGS])  # the next run starts afresh
                 first = reports[listed[0]]
                 raise StereovoxError(
                     f"not one recording could be used, no map is written ({first.recording}: {first.error})"
@@ -188,9 +189,9 @@ def map_fleet(
 def settings_for(
     recordings: Sequence[Recording], profile: str | Path | Config | None, overrides: Mapping[str, Any]
 ) -> tuple[Config, list[str]]:
-    """Return the settings of a fleet, what the first recording suggests where no profile is given, and lines about it.
+    """Return the settings of a fleet, as the first recording suggests if no profile is given, and lines about it.
 
-    Raises ConfigError for settings under which boxes cannot be mapped one by one.
+    Raises ConfigError for settings with which boxes cannot be mapped one by one.
     """
     chosen, lines = suggested(recordings, overrides) if profile is None else ({}, [])
     config = load_config("default" if profile is None else profile, **{**overrides, **chosen})
@@ -205,21 +206,21 @@ def settings_for(
 
 
 def suggested(recordings: Sequence[Recording], overrides: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return the settings that the first of the recordings suggests that can be opened, and lines about them.
+    """Return the settings that the first readable recording suggests, and lines about them.
 
-    One in an object store is copied for that.
+    A recording in an object store is copied for that.
     """
     for one in recordings:
         with TemporaryDirectory(prefix="stereovox-") as folder, suppress(StereovoxError, OSError):
-            # what is wrong with one is reported later; the next may do
+            # its fault is reported later; the next may do
             return survey(open_source(local(one.where, Path(folder))), SURVEYED).settings(overrides, PICTURES_UPRIGHT)
     return {}, []
 
 
 def box_side(box_m: float | None, config: Config) -> int:
-    """Return the side of a fleet's boxes in cells: of `box_m` metres, else 256, or 512 where frames reach far.
+    """Return the side of a fleet's boxes in cells: of `box_m` metres, else 256, or 512 if frames reach far.
 
-    A frame is in about (1 + reach / side)^2 boxes. A box that is known through and through takes 34 MB with 256 cells,
+    A frame is in about (1 + reach / side)^2 boxes. A completely known box takes 34 MB with 256 cells,
     eight times as much with 512. Raises StereovoxError as `side_of`.
     """
     if box_m is not None:
@@ -237,31 +238,30 @@ def _layout(
     notify: Callable[[str], None],
     overrides: Mapping[str, Any],
 ) -> BoxLayout:
-    """Return settings and boxes, those of a run before where one is gone on with."""
+    """Return settings and boxes, or an earlier run's if it is continued."""
     known = _known_layout(place)
     if known is None and place.find(MANIFEST) is not None:
         raise MapFileError(f"{place}: is a map that no fleet made, and would be lost; choose another name")
     if known is not None and not resume:
         raise MapFileError(
-            f"{place}: there is a map already, or what was begun of one; go on with it with --resume, "
-            "or choose another name"
+            f"{place}: there is already a map, or a part of one; continue it with --resume, or choose another name"
         )
     config, lines = settings_for(listed, known.config if known is not None and profile is None else profile, overrides)
     layout = BoxLayout(config, known.side if known is not None and box_m is None else box_side(box_m, config))
     if known is not None and (_settings(layout) != _settings(known)):
-        raise MapFileError(f"{place}: was made with other settings; leave them out to go on, or choose another name")
+        raise MapFileError(f"{place}: was made with other settings; leave them out to continue, or choose another name")
     for line in lines:
         notify(f"note: {line}")
     return layout
 
 
 def _settings(layout: BoxLayout) -> dict[str, Any]:
-    """Return settings and boxes as plain values for JSON, but for what does not matter to cells."""
+    """Return settings and boxes as plain values for JSON, except settings that do not affect cells."""
     return {"config": layout.config.model_dump(mode="json", exclude={"threads"}), "side": layout.side}
 
 
 def _known_layout(place: Place) -> BoxLayout | None:
-    """Return settings and boxes of a run before; None if there was none."""
+    """Return settings and boxes of an earlier run; None if there was none."""
     known = place.find(SETTINGS, MAX_SETTINGS)
     try:
         values = None if known is None else unsealed(known)
@@ -273,7 +273,7 @@ def _known_layout(place: Place) -> BoxLayout | None:
 def _indexed(
     run: Cluster, place: Place, keys: Mapping[Recording, str], layout: BoxLayout, progress: Progress
 ) -> dict[Recording, RecordingReport]:
-    """Return what each recording gave; those that were not mapped alone before are."""
+    """Return the report of each recording, mapping the ones not yet mapped alone."""
     reports = {one: report for one, key in keys.items() if (report := report_of(place, key)) is not None}
     missing = {one.where: one for one in keys if one not in reports}
     tasks = {where: (place, one, layout, keys[one]) for where, one in missing.items()}
@@ -285,7 +285,7 @@ def _indexed(
 
 
 def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[str, int]]) -> list[Box]:
-    """Return the boxes that the frames of recordings see; given are the key of each and its number of frames."""
+    """Return the boxes that recordings' frames see; used: key and number of frames of each."""
     start_ns = None
     if layout.config.map.keep_times:
         with frames_of(place, used[0][0], [0]) as frames:
@@ -294,22 +294,22 @@ def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[str, int]]) -> 
 
 
 def _check_still_there(place: Place, reports: Mapping[Recording, RecordingReport]) -> None:
-    """Raise StereovoxError if a recording that the map is made of cannot be read now: it would be taken away."""
+    """Raise StereovoxError if a recording in the map is now unreadable: it would be removed."""
     if place.find(MANIFEST) is None:
         return
     made_of = read_boxed_manifest(place).extra.get("fleet", {}).get("recordings", [])
     for one, report in reports.items():
         if report.error and one.where in made_of:
             raise StereovoxError(
-                f"{one.where}: is in the map and cannot be used now ({report.error}); mend it, or leave it out to "
-                "take it away"
+                f"{one.where}: is in the map and cannot be used now ({report.error}); repair it, or leave it out to "
+                "remove it"
             )
 
 
 def _mapped(
     run: Cluster, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: BoxesBefore, progress: Progress
 ) -> tuple[dict[str, DoneBox], list[DoneBox]]:
-    """Return all boxes by what they are made of, and those of them that no run before has mapped, which are mapped."""
+    """Return all boxes by their inputs, and the ones mapped now because no earlier run had."""
     names, mapped = {box.inputs(layout): box for box in boxes}, list[DoneBox]()
     done = before.boxes(layout, names)
     tasks = {inputs: (place, layout, box) for inputs, box in names.items() if inputs not in done}
@@ -329,7 +329,7 @@ def _levels(
     before: BoxesBefore,
     progress: Progress,
 ) -> list[list[BoxEntry]]:
-    """Return the coarser levels, each made of the one before where a run before has not made it of the same boxes."""
+    """Return the coarser levels, each made from the one before unless an earlier run made it from the same boxes."""
     levels: list[list[BoxEntry]] = []
     while not is_top(entries):
         of, known = {names_of(family): family for family in families(entries).values()}, before.parents(layout)
@@ -366,7 +366,7 @@ def _manifest(
 
 
 def _sweep(place: Place, manifest: BoxedManifest, keys: set[str]) -> None:
-    """Remove what the map is not made of any more, word of boxes before the boxes."""
+    """Remove what the map no longer uses, entries of boxes before the boxes."""
     old = [file for file in place.names(f"{RECORDINGS}/") if file.split("/")[1] not in keys]
     place.remove([*place.names(f"{DONE}/"), *old])
     sweep_boxes(place, manifest.names)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fleet's run will cost, by a look at a few frames of each recording; nothing is written."""
+"""Cost estimate of a fleet's run, from a few frames of each recording; nothing is written."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from stereovox.opening import open_source
 from stereovox.sources.poses.trajectory import Trajectory
 
 LOOKED_AT = 24
-"""Frames of a recording that are looked at, spread over it; the first of all compiles and does not count."""
+"""Frames sampled from a recording, evenly chosen; the very first compiles and does not count."""
 
 
 @dataclass(frozen=True)
 class FleetPlan:
-    """What a run will cost, about.
+    """Approximate cost of a run.
 
     Attributes:
-        recordings: Number of recordings that can be read.
+        recordings: Number of readable recordings.
         frames: Number of their frames.
         box_m: Side of a box in metres.
-        boxes: Number of boxes that the frames that were looked at see: at least so many.
-        overlap: In how many boxes a frame is, on the average.
-        bytes: Of the depth images that are kept for adding and correcting recordings later.
+        boxes: Number of boxes that the sampled frames see, a lower bound.
+        overlap: Average number of boxes per frame.
+        bytes: Bytes of the depth images kept for adding and correcting recordings later.
         core_hours: Hours of a core like one of this machine.
-        unreadable: Recordings that cannot be read, or whose file of poses cannot, and why.
+        unreadable: Recordings with unreadable data or poses, and why.
     """
 
     recordings: int
@@ -66,10 +66,10 @@ def plan_fleet(
     """Estimate what `map_fleet` will cost.
 
     Args:
-        recordings: As for `map_fleet`; those in object stores are copied, one at a time, to be looked at.
+        recordings: As for `map_fleet`; recordings in object stores are copied, one at a time, to be inspected.
         profile: As for `map_fleet`.
         box_m: As for `map_fleet`.
-        progress: Called with recordings done, their number, and the current activity.
+        progress: Called with recordings done, the total, and the current activity.
         **overrides: Settings by name.
 
     Returns:
@@ -91,11 +91,11 @@ def plan_fleet(
                 unreadable.append(f"{one.where}: {why_not(one, error, Path(folder))}")
                 continue
             finally:
-                progress(n, len(listed), "looking at recordings")
+                progress(n, len(listed), "inspecting recordings")
         frames, stored, seconds = frames + length, stored + length * each_bytes, seconds + length * each_s
         seen.append((one.where, rows, length))
     if not seen:
-        raise StereovoxError(f"not one recording can be read ({unreadable[0]})")
+        raise StereovoxError(f"no recording can be read ({unreadable[0]})")
     boxes = {tuple(box) for _, rows, _ in seen for box in rows[:, 1:].tolist()}
     overlap = sum(length * len(rows) / max(len(np.unique(rows[:, 0])), 1) for _, rows, length in seen) / frames
     hours = seconds * (1 + overlap) / 3600
@@ -104,9 +104,9 @@ def plan_fleet(
 
 
 def _looked_at(recording: Recording, layout: BoxLayout, folder: Path) -> tuple[int, np.ndarray, float, float]:
-    """Return the number of frames, boxes that some see (as `boxes_seen`), and seconds and bytes of one frame."""
+    """Return the number of frames, boxes that a sample sees (as `boxes_seen`), and seconds and bytes per frame."""
     if recording.poses is not None:
-        Trajectory(Path(local(recording.poses, folder / POSES)))  # raises where the run could not read it
+        Trajectory(Path(local(recording.poses, folder / POSES)))  # raises if the run could not read it
     source = open_source(local(recording.where, folder / COPY))
     step = max(1, len(source) // LOOKED_AT)
     mapper = Mapper(load_config(layout.config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
@@ -118,6 +118,6 @@ def _looked_at(recording: Recording, layout: BoxLayout, folder: Path) -> tuple[i
         times.append(perf_counter() - started)
     kept = mapper.map.kept_frames
     if kept is None or not len(kept):
-        raise StereovoxError("not one frame of those that were looked at can be used")
+        raise StereovoxError("none of the sampled frames can be used")
     rows = np.concatenate([np.insert(boxes, 0, n, axis=1) for n, boxes in enumerate(seen)])
     return len(source), rows, float(np.median(times)), kept.bytes / len(kept)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of a fleet: their names, and each mapped alone, which says which of its frames can be trusted.
+"""The recordings of a fleet: their names, and each mapped alone, which determines its trusted frames.
 
-What is kept of a recording lies in `recordings/KEY/`: the depth images of its trusted frames, without loss, which
-boxes each sees, and the history of the map that they made. The key is made of all that this depends on.
+A recording's results are in `recordings/KEY/`: the depth images of its trusted frames, without loss, the boxes each
+sees, and the history of their map. The key is derived from all that these depend on.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from stereovox.runs.recording import MapRun
 from stereovox.sources.bags.recording import file_part
 
 VERSION = 2
-"""Of what is kept of a recording; another one is made anew."""
+"""Version of a recording's results; others are redone."""
 RECORDINGS = "recordings"
 SETTINGS = "fleet.json"
-"""The settings that a place's recordings are mapped with, written once there are workers, before anything else."""
+"""File of a place's mapping settings, written first, once there are workers."""
 SEEN, REPORT = "seen.npy", "report.json"
 COPY, POSES = "recording", "poses"
-"""Folders into which a recording of an object store, and the file of its poses, are copied."""
+"""Folders for the copies of a recording from an object store, and of its poses."""
 TEXTS = (".txt", ".md", ".csv", ".json", ".yaml", ".yml", ".toml", ".log")
-"""Endings of files that lie next to recordings and hold text."""
+"""Endings of text files next to recordings."""
 MAX_REPORT = 1 << 24
-"""Bytes of a report."""
+"""Most bytes of a report."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ class Recording:
 
     Attributes:
         where: Folder, file, simulation or `s3://` prefix, as `open_source` takes it.
-        poses: File with corrected poses (TUM), as `remap` takes it; None: those of the recording.
+        poses: File with corrected poses (TUM), as `remap` takes it; None: the recording's own.
     """
 
     where: str
     poses: str | None = None
 
     def key(self, layout: BoxLayout) -> str:
-        """Return a name made of all that is kept: the files as they are now, the poses, the settings and the boxes."""
+        """Return a name derived from all inputs: the files as they are now, the poses, the settings and the boxes."""
         settings = [layout.side, layout.config.model_dump(mode="json", exclude={"threads"})]
         files = [fingerprint(self.where), None if self.poses is None else fingerprint(self.poses)]
         return digest([VERSION, self.where, files, settings])
@@ -80,14 +80,14 @@ Recordings = str | Path | Recording | Iterable[str | Path | Recording]
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """What a recording gave.
+    """The report of a recording.
 
     Attributes:
         recording: Its name.
         frames: Trusted frames.
         refused: Refused frames by reason.
-        seconds: Time it took to map it alone; 0 where that was done before.
-        error: Why nothing of it is in the map, one line; "" if it is.
+        seconds: Time it took to map it alone; 0 if done before.
+        error: Why nothing of it is in the map, one line; "" if something is.
         notes: What was assumed about it.
     """
 
@@ -104,19 +104,18 @@ class RecordingReport:
 
 
 def recordings_of(names: Recordings) -> list[Recording]:
-    """Return the recordings that names stand for, in their order.
+    """Return the recordings given by names, in their order.
 
     Args:
-        names: One or more: recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: in each line a recording,
-            and the file of its corrected poses if there is one, both from where the list is; # begins a comment), or
-            `Recording`.
+        names: One or more: recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: each line has a recording,
+            and the file of its corrected poses, if any, both relative to the list; # starts a comment), or `Recording`.
 
     Returns:
-        The recordings; none twice. A pattern leaves out maps, and files of text that are no recordings.
+        The recordings, each once. A pattern skips maps, and text files that are no recordings.
 
     Raises:
-        StereovoxError: A pattern fits nothing, a list cannot be read, there is no recording, or one is named twice,
-            also by the name of a link.
+        StereovoxError: A pattern matches nothing, a list cannot be read, there is no recording, or one is named twice,
+            including through a link.
     """
     found: list[Recording] = []
     for name in [names] if isinstance(names, (str, Path, Recording)) else names:
@@ -135,10 +134,10 @@ def recordings_of(names: Recordings) -> list[Recording]:
 
 
 def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: str) -> RecordingReport:
-    """Map a recording alone, and put what is kept of it into a place, the report last; a task of a worker.
+    """Map a recording alone, and write its results to a place, the report last; a worker's task.
 
-    key: as `Recording.key` was when the run began; on another machine, or of files that change, it may be another one.
-    What cannot be read or mapped is reported in the report. Raises MapFileError if the place cannot be written.
+    key: `Recording.key` at the start of the run; on another machine, or if files change, it may differ now.
+    Read and mapping errors go into the report. Raises MapFileError if the place cannot be written.
     """
     notes, started = list[str](), perf_counter()
     home = place / f"{RECORDINGS}/{key}"
@@ -163,12 +162,12 @@ def index_recording(place: Place, recording: Recording, layout: BoxLayout, key: 
 
 
 def why_not(recording: Recording, error: Exception, folder: Path) -> str:
-    """Return in one line why a recording cannot be used, also where what reads it failed in a way nobody foresaw.
+    """Return in one line why a recording is unusable, including unexpected reader failures.
 
-    Raises the error itself if it is not the recording's: in `folder`, for its copy and its map, is no room.
+    Raises the error itself if it is not the recording's: `folder` has no room for its copy and its map.
     """
     if isinstance(error, MemoryError):
-        return "there is too little memory for it; go on with --resume and fewer --workers"
+        return "there is too little memory for it; continue with --resume and fewer --workers"
     if isinstance(error, OSError):
         if error.errno in DISK_FULL:
             raise error
@@ -183,7 +182,7 @@ def why_not(recording: Recording, error: Exception, folder: Path) -> str:
 
 
 def _named(text: str, recording: Recording, folder: Path) -> str:
-    """Return a text with names in an object store in place of those of the copies in `folder`."""
+    """Return a text with names of copies in `folder` replaced by names in the object store."""
     for copy, where in ((COPY, recording.where), (POSES, recording.poses)):
         if where is not None and is_url(where):
             text = text.replace(str(folder / copy), where.rpartition("/")[0])
@@ -191,7 +190,7 @@ def _named(text: str, recording: Recording, folder: Path) -> str:
 
 
 def report_of(place: Place, key: str) -> RecordingReport | None:
-    """Return the report of a recording that was indexed before, None if it was not."""
+    """Return the report of a recording that was already indexed, else None."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
     try:
         return None if saved is None else RecordingReport(**{**unsealed(saved), "seconds": 0.0})
@@ -200,9 +199,9 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
 
 
 def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
-    """Return which trusted frames of a recording see which boxes: (n, 4) number and index, by number.
+    """Return the boxes seen by a recording's trusted frames: (n, 4) frame number and box index, by number.
 
-    Raises MapFileError if that is damaged.
+    Raises MapFileError if the file is damaged.
     """
     data = (place / f"{RECORDINGS}/{key}").read(SEEN)
     if digest_of(data) != manifest_of(place, key).get("seen"):
@@ -211,7 +210,7 @@ def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
 
 
 def manifest_of(place: Place, key: str) -> dict[str, Any]:
-    """Return the manifest of the map that a recording made alone. Raises MapFileError if it is damaged."""
+    """Return the manifest of a recording's own map. Raises MapFileError if it is damaged."""
     data = (place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST)
     try:
         manifest = unsealed(data)
@@ -223,7 +222,7 @@ def manifest_of(place: Place, key: str) -> dict[str, Any]:
 
 @contextmanager
 def frames_of(place: Place, key: str, numbers: Sequence[int]) -> Iterator[Iterator[KeptFrame]]:
-    """Yield some of the trusted frames of a recording, ascending; of an object store each pack is fetched once."""
+    """Yield some trusted frames of a recording, ascending; each pack of an object store is fetched once."""
     home, saved = place / f"{RECORDINGS}/{key}", manifest_of(place, key)["kept_frames"]
     if isinstance(home, Folder):
         frames = _kept(place, key, home.path, saved)
@@ -244,26 +243,26 @@ def read_frame(place: Place, key: str, frame: KeptFrame) -> Frame | Cloud:
 
 
 def digest(parts: Any) -> str:
-    """Return 24 hexadecimal digits that stand for plain values."""
+    """Return a digest of plain values, 24 hexadecimal digits."""
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def _mapped_alone(
     recording: Recording, layout: BoxLayout, folder: Path, notes: list[str]
 ) -> tuple[Path, list[NDArray[np.int64]]]:
-    """Return the folder of the map of a recording, which kept its frames, and the boxes (n, 3) that each sees."""
-    keeping, told = load_config(layout.config, **{"map.keep_frames": True}), list[NDArray[np.int64]]()
+    """Return the folder of a recording's map, which kept its frames, and the boxes (n, 3) that each frame sees."""
+    keeping, by_frame = load_config(layout.config, **{"map.keep_frames": True}), list[NDArray[np.int64]]()
     source = local(recording.where, folder / COPY)
-    settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # others' worlds are not ours
+    settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # tracked maps have other worlds
 
-    def tell(note: str) -> None:
+    def report(note: str) -> None:
         notes.append(_named(note, recording, folder))
 
-    with MapRun(source, folder / "map", **settings, notify=tell) as run:
-        run.mapper.map.listeners.append(lambda evidence: told.append(boxes_with(layout, evidence)))
+    with MapRun(source, folder / "map", **settings, notify=report) as run:
+        run.mapper.map.listeners.append(lambda evidence: by_frame.append(boxes_with(layout, evidence)))
         made = run.finish()
     if recording.poses is None:
-        return folder / "map", _by_frame(layout, _all_kept(made.map), told)
+        return folder / "map", _by_frame(layout, _all_kept(made.map), by_frame)
     remapped = remap(folder / "map", local(recording.poses, folder / POSES), folder / "remapped")
     return remapped.out, [_around(layout, frame) for frame in _all_kept(remapped.map)]
 
@@ -276,15 +275,15 @@ def _all_kept(voxel_map: VoxelMap) -> Sequence[KeptFrame]:
 
 
 def _by_frame(
-    layout: BoxLayout, frames: Sequence[KeptFrame], told: Sequence[NDArray[np.int64]]
+    layout: BoxLayout, frames: Sequence[KeptFrame], by_frame: Sequence[NDArray[np.int64]]
 ) -> list[NDArray[np.int64]]:
-    """Return the boxes that each frame sees, as a map's listener learns them: nothing if there was no evidence.
+    """Return the boxes that each frame sees, as collected by a map's listener: none if there was no evidence.
 
-    It learned less about cells whose rounding depends on the frame's number, which is another one among recordings.
+    If rounding depends on the frame's number, which differs among recordings, the listener's boxes are too few.
     """
     if layout.config.map.cell != "int16":
         return [_around(layout, frame) for frame in frames]
-    coming = iter(told)
+    coming = iter(by_frame)
     nothing = np.empty((0, 3), np.int64)
     seen = [next(coming) if (frame.blocks[1] > frame.blocks[0]).all() else nothing for frame in frames]
     assert next(coming, None) is None
@@ -292,7 +291,7 @@ def _by_frame(
 
 
 def _around(layout: BoxLayout, frame: KeptFrame) -> NDArray[np.int64]:
-    """Return the boxes from the lowest to the highest that a frame sees; more than it does."""
+    """Return all boxes within the bounds of a frame's view: more than it sees."""
     if not (frame.blocks[1] > frame.blocks[0]).all():
         return np.empty((0, 3), np.int64)
     low, high = layout.indices_of(frame.blocks[0]), layout.indices_of(frame.blocks[1] - 1)
@@ -311,7 +310,7 @@ def boxes_with(layout: BoxLayout, evidence: Evidence) -> NDArray[np.int64]:
 
 
 def local(where: str, folder: Path) -> str:
-    """Return a recording as this machine can open it: that of an object store is copied to `folder`."""
+    """Return a recording that this machine can open: one in an object store is copied to `folder`."""
     if not is_url(where):
         return where
     place, files = _stored(where)
@@ -326,7 +325,7 @@ def local(where: str, folder: Path) -> str:
 
 
 def _stored(where: str) -> tuple[Bucket, dict[str, list[Any]]]:
-    """Return the place above a recording in an object store, and what `Bucket.versions` says of its files."""
+    """Return the place above a recording in an object store, and `Bucket.versions` of its files."""
     above, _, name = where.rstrip("/").rpartition("/")
     if above.endswith(":/"):
         raise MapFileError(f"{where}: is a bucket; name a recording in it, {where.rstrip('/')}/NAME")
@@ -336,7 +335,7 @@ def _stored(where: str) -> tuple[Bucket, dict[str, list[Any]]]:
 
 
 def _below(folder: str) -> Iterator[str]:
-    """Yield all files below a folder, also behind links, but no folder twice: links may lead back up."""
+    """Yield all files below a folder, following links, but each folder once: links may lead back up."""
     known: set[str] = set()
     for above, folders, names in os.walk(folder, followlinks=True):
         if (real := os.path.realpath(above)) in known:
@@ -348,7 +347,7 @@ def _below(folder: str) -> Iterator[str]:
 
 
 def _kept(place: Place, key: str, folder: Path, saved: Any) -> Sequence[KeptFrame]:
-    """Return the trusted frames of a recording, the index of which is in `folder`."""
+    """Return the trusted frames of a recording whose index is in `folder`."""
     try:
         kept = read_frames(folder, saved, None)
         assert kept is not None
@@ -385,19 +384,19 @@ def _expanded(name: str) -> list[Recording]:
 
 
 def _lies_beside(path: str) -> bool:
-    """Tell whether what a pattern fits is no recording but lies next to some: a map, or text such as calibrations."""
-    begun = os.path.isfile(os.path.join(path, SETTINGS))  # a map that a fleet has not finished
+    """Return whether a pattern's match is no recording, but a map, or text such as calibrations next to some."""
+    begun = os.path.isfile(os.path.join(path, SETTINGS))  # a map that a fleet has not finished yet
     return is_map(path) or begun or (path.lower().endswith(TEXTS) and os.path.isfile(path) and not is_recording(path))
 
 
 def _real(where: str) -> str:
-    """Return what is the same for all names of a recording: links are followed, options stay."""
+    """Return the canonical name of a recording: links are followed, options stay."""
     path = file_part(where)
     return where if not os.path.exists(path) else os.path.realpath(path) + where.removeprefix(path)
 
 
 def _bare(where: str) -> str:
-    """Return a name without slashes at its end: what is kept of a recording goes by its name."""
+    """Return a name without trailing slashes: results are stored by name."""
     return where if "?" in where else where.rstrip("/") or where
 
 
@@ -420,23 +419,23 @@ def _listed(file: Path) -> list[Recording]:
 
 
 def _beside(file: Path, name: str) -> str:
-    """Return a name in a list as it is from here: a path counts from where the list is."""
+    """Return a name in a list relative to here: paths in it are relative to the list."""
     return name if is_url(name) or ":" in name.partition("/")[0] else str(file.parent / name)
 
 
 def fingerprint(where: str) -> list[Any]:
-    """Return names, sizes and times of the files of a recording (of an object store their tags); no file must be there.
+    """Return names, sizes and times of a recording's files (tags in an object store); files may be missing.
 
     Folders that are links are followed.
     """
     if is_url(where):
-        with suppress(NoBucketError):  # told where the recording is copied
+        with suppress(NoBucketError):  # reported when the recording is copied
             return list(_stored(where)[1].items())
         return []
     path = file_part(where)
     found: list[list[Any]] = []
     for file in [path] if os.path.isfile(path) else _below(path):
-        with suppress(OSError):  # a link that leads nowhere
+        with suppress(OSError):  # a dangling link
             stat = os.stat(file)
             found.append([os.path.relpath(file, path), stat.st_size, stat.st_mtime_ns])
     return sorted(found)

@@ -31,25 +31,25 @@ from stereovox.runs.pose_choice import GIVEN
 from stereovox.runs.recording import MapRun, ended_in_order
 
 VERSION = 2
-"""Of what is kept of a score; another one is made anew."""
+"""Version of a stored score; others are redone."""
 SCORES, TABLE = "scores.json", "scores.csv"
 MAX_ROW = 1 << 22
-"""Bytes of what is kept of one recording."""
+"""Most bytes of one recording's stored scores."""
 COLUMNS: tuple[str, ...] = (
     "recording", "profile", "frames", "refused", "tp", "fp", "tn", "fn", "accuracy", "precision", "recall",
     "specificity", "npv", "error", "correlation", "tolerance_precision", "tolerance_recall", "coverage",
 )  # fmt: skip
-"""Of the table: those of Table 8.1, what they are of, and three that forgive cells next to each other."""
+"""Columns of the table: as in Table 8.1, plus three that forgive neighbouring cells."""
 
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """How maps are compared with the truth.
+    """Options for comparing maps with the truth.
 
     Attributes:
         free: Which cells are free in truth: all others in `view`, or those that `rays` cross; see `lidar_truth`.
         frames: Frames of each recording (`A:B:S`); None: all.
-        threshold: A cell is called occupied above it.
+        threshold: A cell is called occupied above this probability.
         tolerance: Cells within which a surface counts as found.
     """
 
@@ -61,16 +61,16 @@ class ScoreOptions:
 
 @dataclass(frozen=True)
 class RecordingScore:
-    """How good the map of one recording is.
+    """The score of one recording's map.
 
     Attributes:
         recording: Its name.
-        profile: Of the map.
+        profile: Profile of the map.
         frames: Frames in the map.
         refused: Refused frames.
         scores: All measures, as `Scores.as_dict` names them; empty if there are none.
         seconds: Time it took.
-        error: Why it has no scores, one line; "" if it has.
+        error: Why it has no scores, one line; "" if it has some.
     """
 
     recording: str
@@ -82,7 +82,7 @@ class RecordingScore:
     error: str = ""
 
     def row(self) -> dict[str, Any]:
-        """Return its row of the table: a value for each of `COLUMNS`."""
+        """Return its table row: a value for each of `COLUMNS`."""
         known = {"recording": self.recording, "profile": self.profile, "frames": self.frames, "refused": self.refused}
         return {name: known.get(name, self.scores.get(name)) for name in COLUMNS}
 
@@ -102,7 +102,7 @@ class FleetScores:
     def table(self) -> list[dict[str, Any]]:
         """Return the rows of the table, then one for all recordings of each profile.
 
-        That adds up the cells; its error is that of all observed cells together, and it has no correlation.
+        That row sums the cells; its error is over all observed cells together, and it has no correlation.
         """
         good = [one for one in self.scored if not one.error]
         profiles = dict.fromkeys(one.profile for one in good)
@@ -128,32 +128,32 @@ def score_fleet(
     notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> FleetScores:
-    """Map each of many recordings alone, and score its map against the truth that its lidar gives.
+    """Map each of many recordings alone, and score its map against the truth from its lidar.
 
-    What is done stays: the same call with `resume` scores only recordings, profiles and settings that are new.
+    Finished work is kept: the same call with `resume` scores only new recordings, profiles and settings.
 
     Args:
-        recordings: See `recordings_of`; each must have a lidar, as KITTI's have.
+        recordings: See `recordings_of`; each must have a lidar, as in KITTI.
         out: Folder or URL for `scores.csv` (the table) and `scores.json` (all measures).
         profiles: Profiles to compare: names, TOML files or `Config`; None: the default one with the cell size and range
             that the first recording suggests, as for `map_fleet`.
-        options: How maps are compared with the truth; None: as Valenti 2018 does.
-        resume: Go on with scores that are there.
+        options: How maps are compared with the truth; None: as in Valenti 2018.
+        resume: Continue existing scores.
         workers: Processes of a cluster of this machine; None: one for each core.
-        scheduler: Address of a Dask scheduler (`tcp://host:8786`) in place of that.
+        scheduler: Address of a Dask scheduler (`tcp://host:8786`) instead.
         progress: Called with steps done, steps in all, and the current activity.
         notify: Called with a line about settings that the recording suggests.
         **overrides: Settings by name, for all profiles.
 
     Returns:
-        The scores; a recording without is reported there.
+        The scores; recordings without one are reported there.
 
     Raises:
-        StereovoxError: One line: a setting or `options` is wrong, not one recording could be scored, or the cluster
+        StereovoxError: One line: a setting or `options` is wrong, no recording could be scored, or the cluster
             failed.
         MapFileError: Something else is at `out`, or it cannot be written.
         MissingExtra: Dask or obstore is not installed.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; what is done stays.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP; finished work is kept.
     """
     options = _checked(options or ScoreOptions())
     listed, place = recordings_of(recordings), Place.of(out)
@@ -188,15 +188,15 @@ def score_fleet(
 def score_recording(
     place: Place, recording: Recording, configs: Mapping[str, Config], options: ScoreOptions
 ) -> dict[str, RecordingScore]:
-    """Score a recording's maps under settings by their keys, and keep each score in a place; a task of a worker."""
+    """Score a recording's maps under settings by their keys, and store each score in a place; a worker's task."""
     truths, rows, where = dict[tuple[float, float], TruthCells](), dict[str, RecordingScore](), ""
     with TemporaryDirectory(prefix="stereovox-") as folder:
         for number, (key, config) in enumerate(configs.items()):
             started = perf_counter()
             try:
-                where = where or local(recording.where, Path(folder) / COPY)  # of an object store once
+                where = where or local(recording.where, Path(folder) / COPY)  # from an object store only once
                 sizes = config.voxel_size, config.max_range
-                if sizes not in truths:  # first: a recording without a lidar is not mapped for nothing
+                if sizes not in truths:  # first, so that a recording without a lidar is not mapped in vain
                     source: Any = open_source(where)
                     truth, _ = lidar_truth(source, *sizes, options.free, options.frames)
                     truths[sizes] = TruthCells(truth, options.tolerance)
@@ -205,7 +205,7 @@ def score_recording(
                 why = why_not(recording, error, Path(folder))
                 row = RecordingScore(recording.where, config.profile, error=why)
             rows[key] = replace(row, seconds=perf_counter() - started)
-            if not row.error:  # what failed is tried again
+            if not row.error:  # failures are retried
                 (place / "scores").write(f"{key}.json", sealed(asdict(rows[key])))
     return rows
 
@@ -221,7 +221,7 @@ def _scored(
 
 
 def _checked(options: ScoreOptions) -> ScoreOptions:
-    """Return how maps are compared; raises StereovoxError for bad values, before any work."""
+    """Return the validated options; raises StereovoxError for bad values, before any work."""
     level(options.threshold)
     if options.free not in FREE:
         raise StereovoxError(f"free '{options.free}' is not known; say {' or '.join(FREE)}")
@@ -231,7 +231,7 @@ def _checked(options: ScoreOptions) -> ScoreOptions:
 
 
 def _check_target(place: Place, resume: bool) -> None:
-    """Raise MapFileError if scores do not belong."""
+    """Raise MapFileError if a place is not for scores."""
     if place.find(MANIFEST) is not None:
         raise MapFileError(f"{place}: is a map; choose another name for the scores")
     there = [name for name in place.names("") if not name.startswith(".")]
@@ -239,11 +239,11 @@ def _check_target(place: Place, resume: bool) -> None:
     if foreign:
         raise MapFileError(f"{place}: holds other things ({foreign[0]}); choose another name for the scores")
     if there and not resume:
-        raise MapFileError(f"{place}: there are scores already; go on with them with --resume, or choose another name")
+        raise MapFileError(f"{place}: there are already scores; continue them with --resume, or choose another name")
 
 
 def _keys(recording: Recording, configs: Sequence[Config], options: ScoreOptions) -> dict[str, Config]:
-    """Return the settings by names made of all that the scores under them depend on."""
+    """Return the settings by names derived from all that their scores depend on."""
     of = [VERSION, recording.where, fingerprint(recording.where), asdict(options)]
     return {digest([*of, config.model_dump(mode="json", exclude={"threads"})]): config for config in configs}
 

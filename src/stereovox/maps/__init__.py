@@ -48,7 +48,7 @@ def _kept_frames(config: Config, resume: VoxelMap | None) -> KeptFrames | None:
         return KeptFrames(config.map.frames_budget)
     if (kept := resume.storage.kept) is not None:
         return KeptFrames(config.map.frames_budget, kept.frames, kept.spacing)
-    raise ConfigError("cannot go on: the map did not keep its frames; set map.keep_frames=false, or begin a new map")
+    raise ConfigError("cannot continue: the map did not keep its frames; set map.keep_frames=false, or begin a new map")
 
 
 def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelMap:

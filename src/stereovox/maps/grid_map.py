@@ -60,7 +60,7 @@ class GridStorage(Guarded):
         for name in ("voxel_size", "map", "grid.prior"):
             old, new = (attrgetter(name)(settings) for settings in (self.config, config))
             if old != new:
-                raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+                raise ConfigError(f"cannot continue: the map was made with {name} {old}, the new setting is {new}")
         self.config = config
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
@@ -197,7 +197,7 @@ class GridMap(Guarded, OnStorage):
         """
         if not isclose(grid.resolution, config.voxel_size, rel_tol=1e-5):
             raise ConfigError(
-                f"cannot go on: the map has cells of {grid.resolution:g} m, not {config.voxel_size:g}; "
+                f"cannot continue: the map has cells of {grid.resolution:g} m, not {config.voxel_size:g}; "
                 f"set voxel_size to {grid.resolution:g}"
             )
         grid_map = cls(config, grid.origin)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a body is now: its newest pose, carried on by its last motion for as long as that pose is old."""
+"""The current pose of a body: its newest pose, extrapolated by its last motion."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from stereovox.kernels.threads import MapLock
 from stereovox.sources.poses.live_poses import MAX_SPEED_MPS, MAX_TURN_DPS
 
 KEPT = 64
-"""Last poses that are kept."""
+"""Number of latest poses kept."""
 SHORTEST_NS, LONGEST_NS = 40_000_000, 300_000_000
-"""Between the two poses that tell the motion: in less, noise would; over more, the motion has changed."""
+"""Time between the two poses that give the motion: less is noise; over more, the motion has changed."""
 SLACK_M, SLACK_RAD = 0.05, np.radians(2)
-"""What is never a jump, as for the map's gate."""
+"""Motion that is never a jump, as for the map's gate."""
 
 
 class BodyPose(NamedTuple):
-    """A pose of a body and when it came, in nanoseconds. T_world_body: (4, 4), body in optical axes."""
+    """A pose of a body, its time and its arrival, in nanoseconds. T_world_body: (4, 4), body in optical axes."""
 
     stamp_ns: int
     came_ns: int
@@ -33,7 +33,7 @@ class Body:
     """The last poses of a body, in order of their stamps. Threads may share it.
 
     Attributes:
-        jumped_ns: Stamp of the last pose that the body cannot have reached from the one before; None: all are in reach.
+        jumped_ns: Stamp of the last pose out of the body's reach from the one before; None: there was none.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class Body:
         self.jumped_ns: int | None = None
 
     def take(self, pose: BodyPose) -> None:
-        """Take in a pose, unless a newer one is there; of two with one stamp the later one counts."""
+        """Add a pose, unless there is a newer one; of two with one stamp the later one counts."""
         with self._lock:
             if self._poses and pose.stamp_ns < self._poses[-1].stamp_ns:
                 if self._poses[-1].stamp_ns - pose.stamp_ns <= RESET_NS:
@@ -50,7 +50,7 @@ class Body:
                 self._poses.clear()  # the clock was set back
                 self.jumped_ns = pose.stamp_ns
             if self._poses and not _in_reach(self._poses[-1], pose):
-                self._poses.clear()  # no motion leads across a jump
+                self._poses.clear()  # do not extrapolate across a jump
                 self.jumped_ns = pose.stamp_ns
             if self._poses and self._poses[-1].stamp_ns == pose.stamp_ns:
                 self._poses.pop()
@@ -63,9 +63,9 @@ class Body:
             return self._poses[-1] if self._poses else None
 
     def after(self, ahead_ns: int) -> Transform | None:
-        """Return T_world_body (4, 4) so long after the newest pose, if the body moved on as before; None without any.
+        """Return T_world_body (4, 4) extrapolated by `ahead_ns` from the newest pose; None without any.
 
-        It is not carried on by more than LONGEST_NS, and stands still where only one pose is known.
+        It is extrapolated by at most LONGEST_NS, and not at all if only one pose is known.
         """
         with self._lock:
             if not self._poses:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an autopilot's clock shows, by this machine's: TIMESYNC messages, or else the least delay of what it sends.
+"""The offset of an autopilot's clock: from TIMESYNC messages, or else from the least message delay.
 
-TIMESYNC (https://mavlink.io/en/services/timesync.html): we send our time ts1, the autopilot returns it next to its own,
-tc1; if both ways take as long, its clock was ahead of ours by tc1 - (ts1 + now) / 2, as in PX4's mavlink_timesync.cpp.
-Of the last answers the one with the shortest round trip counts, whose error is at most half of that.
+TIMESYNC (https://mavlink.io/en/services/timesync.html): we send our time ts1, the autopilot returns it with its own,
+tc1; if both directions take equally long, its clock was ahead of ours by tc1 - (ts1 + now) / 2, as in PX4's
+mavlink_timesync.cpp. The latest answer with the shortest round trip counts; its error is at most half of that.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from collections import deque
 from threading import Lock
 
 ANSWERS = 32
-"""Last answers to TIMESYNC that are remembered."""
+"""Number of latest TIMESYNC answers kept."""
 HEARD = 200
-"""Last messages whose delay is remembered."""
+"""Number of latest message delays kept."""
 ENOUGH = 20
-"""Messages that must have come before the least of their delays is believed."""
+"""Fewest messages before their least delay is trusted."""
 LONGEST_ROUND_TRIP_NS = 100_000_000
-"""Answers that took longer are passed over."""
+"""Answers that took longer are ignored."""
 SET_BACK_NS, SLACK_NS = 100_000_000, 5_000_000
-"""A clock that goes back by more than messages overtake each other was set; so was one that by its answers cannot be
-what it was before: each is off by half of its round trip at most, and by what clocks drift meanwhile."""
+"""A clock that goes back by more than messages overtake each other was set; so was one that contradicts its earlier
+answers: each is off by at most half of its round trip plus drift meanwhile."""
 
 
 class RemoteClock:
-    """Turns times of another machine into this one's. Threads may share it.
+    """Converts times of another machine to this one's. Thread-safe.
 
-    Without TIMESYNC, times come out late by the least delay of the link, which is not known.
+    Without TIMESYNC, times are late by the least delay of the link, which is unknown.
 
     Attributes:
-        times_set: How often the other clock was set, or started again: what was known of it is then forgotten.
+        times_set: Number of times the other clock was set or restarted; earlier data is then dropped.
     """
 
     def __init__(self) -> None:
@@ -42,9 +42,9 @@ class RemoteClock:
         """Take an answer to TIMESYNC.
 
         Args:
-            sent_ns: When it was asked, by this machine (`ts1`).
-            remote_ns: When the other one answered, by its clock (`tc1`).
-            received_ns: When the answer came, by this machine.
+            sent_ns: Time of the request, by this machine (`ts1`).
+            remote_ns: Time of the answer, by the other clock (`tc1`).
+            received_ns: Arrival of the answer, by this machine.
         """
         round_trip_ns = received_ns - sent_ns
         if not 0 <= round_trip_ns <= LONGEST_ROUND_TRIP_NS:
@@ -58,7 +58,7 @@ class RemoteClock:
             self._answers.append((round_trip_ns, offset_ns))
 
     def heard(self, remote_ns: int, received_ns: int) -> None:
-        """Take the time that a message brings, in the other machine's nanoseconds, and when it came, in this one's."""
+        """Add a message's time, in the other machine's nanoseconds, and its arrival, in this one's."""
         with self._lock:
             if remote_ns < self._latest_heard_ns - SET_BACK_NS:
                 self._set_anew()
@@ -75,7 +75,7 @@ class RemoteClock:
 
     @property
     def error_ns(self) -> int | None:
-        """The most by which `offset_ns` is off; None if nobody knows, without TIMESYNC."""
+        """Largest error of `offset_ns`; None if unknown, without TIMESYNC."""
         with self._lock:
             return min(self._answers)[0] // 2 if self._answers else None
 

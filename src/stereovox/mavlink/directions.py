@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MAVLink's OBSTACLE_DISTANCE_3D says of a map: the nearest obstacle in each direction, up and down as well.
+"""MAVLink's OBSTACLE_DISTANCE_3D from a map: the nearest obstacle in each direction, including up and down.
 
 One message is one place (https://mavlink.io/en/messages/ardupilotmega.html#OBSTACLE_DISTANCE_3D), in metres along the
 body's own front, right and down (MAV_FRAME_BODY_FRD, the only frame ArduPilot reads). ArduPilot keeps the nearest place
 in each of 8 sectors of 45 degrees in 5 layers of 30 (AP_Proximity_Boundary_3D.h); messages of one `time_boot_ms` that
-follow each other within 50 ms are one look round, and a new time begins a new one, in which directions without a
+follow each other within 50 ms form one scan, and a new time starts a new scan, in which directions without a
 message are free (AP_Proximity_MAV.cpp, `handle_obstacle_distance_3d_msg`). PX4 does not read this message.
 """
 
@@ -23,21 +23,21 @@ from stereovox.mavlink.sectors import check_number_of_cells, states_of
 
 LAYERS, LAYER_DEG, SECTOR_DEG = 5, 30, 45
 LEAST_M = 0.01
-"""Nearer places are sent at this distance; ArduPilot passes over one at the origin."""
+"""Nearer places are sent at this distance; ArduPilot ignores one at the origin."""
 FRD_OF_OPTICAL = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Turns optical axes (right, down, forward) into front, right, down."""
 
 
 @dataclass(frozen=True)
 class DirectionRules:
-    """How a map is read for directions.
+    """Rules for reading directions from a map.
 
     Attributes:
-        max_distance: Metres up to which cells are looked at.
-        own_radius: Metres about the body within which unknown and tentative cells are taken for the vehicle's own
+        max_distance: Metres up to which cells are inspected.
+        own_radius: Metres around the body within which unknown and tentative cells count as the vehicle's own
             place, as in `SectorRules`.
         oldest_s: As in `SectorRules`.
-        unknown: Whether unknown cells are sent like obstacles. Without, unknown directions are free to ArduPilot.
+        unknown: Whether unknown cells are sent like obstacles. Otherwise ArduPilot treats unknown directions as free.
 
     Raises:
         StereovoxError: A value is out of range.
@@ -68,13 +68,13 @@ def nearest_places(
     Args:
         voxel_map: The map.
         T_world_body: (4, 4) maps the body (optical axes: x right, y down, z forward) into the world.
-        rules: What is looked at; by default `DirectionRules()`.
+        rules: What to inspect; by default `DirectionRules()`.
 
     Returns:
         (N, 3) float64 metres to the front, right and down; N up to 40.
 
     Raises:
-        StereovoxError: The pose is no rigid motion, or there are too many cells to look at.
+        StereovoxError: The pose is not rigid, or there are too many cells to inspect.
     """
     rules = rules or DirectionRules()
     if not rigidity_error(T_world_body) < 1e-3:
@@ -102,7 +102,7 @@ def _cells_within(origin: NDArray[np.float64], cell: NDArray[np.float64], radius
 
 
 def _no_nearer(nearest: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return places (N, 3) at least LEAST_M away: of cells that hold the origin, towards their centres."""
+    """Return places (N, 3) at least LEAST_M away: for cells that contain the origin, towards their centres."""
     length = np.linalg.norm(nearest, axis=1, keepdims=True)
     towards = np.where(length > 0, nearest, centres)
     size = np.linalg.norm(towards, axis=1, keepdims=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A MAVLink connection to one autopilot: heartbeats, clocks compared, messages sent and handed on."""
+"""A MAVLink connection to one autopilot: heartbeats, clock comparison, messages sent and received."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from stereovox.mavlink.clock import RemoteClock
 from stereovox.mavlink.transport import open_transport
 
 AUTOPILOT = 1
-"""MAV_COMP_ID_AUTOPILOT1, the component whose messages count."""
+"""MAV_COMP_ID_AUTOPILOT1, the component whose messages are used."""
 COMPONENT = 196
-"""MAV_COMP_ID_OBSTACLE_AVOIDANCE, what this end calls itself."""
+"""MAV_COMP_ID_OBSTACLE_AVOIDANCE, the identity of this end."""
 HEARTBEAT_NS, TIMESYNC_NS = 1_000_000_000, 200_000_000
 READ_S = 0.05
 Handler = Callable[[Any, int], None]
-"""Called with a message of the autopilot and when it came, in nanoseconds, by the thread that reads."""
+"""Called by the reading thread with a message of the autopilot and its arrival in nanoseconds."""
 Tell = Callable[[str], object]
 
 
 def warn(line: str) -> None:
-    """Tell the user one line, as a RuntimeWarning."""
+    """Warn the user with one line, as a RuntimeWarning."""
     warnings.warn(line, RuntimeWarning, stacklevel=3)
 
 
@@ -40,21 +40,21 @@ def dialect() -> ModuleType:
 
 
 class MavlinkLink:
-    """Connection to an autopilot, as its onboard computer. Threads may share it.
+    """Connection to an autopilot, as its onboard computer. Thread-safe.
 
-    It sends a heartbeat a second (MAV_TYPE_ONBOARD_CONTROLLER), asks for the autopilot's time five times a second,
-    answers when it is asked for its own, and hands messages of the autopilot to whoever `listen`s.
+    It sends a heartbeat a second (MAV_TYPE_ONBOARD_CONTROLLER), requests the autopilot's time five times a second,
+    answers requests for its own, and passes messages of the autopilot to handlers (`listen`).
 
-    MAVLink without signatures is not protected: whoever can send to the port is believed to be the autopilot.
+    MAVLink without signatures is not protected: anyone who can send to the port is taken for the autopilot.
 
     Args:
         url: `udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT` or `serial:DEVICE:BAUD`.
         system: Number of the vehicle (PX4's MAV_SYS_ID, ArduPilot's SYSID_THISMAV); this end has the same.
         clock: This machine's time in nanoseconds.
-        tell: Called with one line when the connection fails and when it works again.
+        tell: Called with one line when the connection fails and when it recovers.
 
     Attributes:
-        clock: Turns the autopilot's times into this machine's.
+        clock: Converts the autopilot's times to this machine's.
         messages: The module of pymavlink's messages and constants.
 
     Raises:
@@ -82,7 +82,7 @@ class MavlinkLink:
         self._handlers.append(handler)
 
     def ignore(self, handler: Handler) -> None:
-        """Call `handler` no more."""
+        """Stop calling `handler`."""
         if handler in self._handlers:
             self._handlers.remove(handler)
 
@@ -90,10 +90,10 @@ class MavlinkLink:
         """Send a message of `messages`.
 
         Args:
-            message: As its `MAVLink_..._message` classes make it.
+            message: An instance of one of its `MAVLink_..._message` classes.
 
         Returns:
-            Whether it could be handed to the system; datagrams may still be lost.
+            Whether the system accepted it; datagrams may still be lost.
         """
         with self._sending:
             done = self._attempt("write", lambda: self._transport.write(message.pack(self._packer)))
@@ -101,7 +101,7 @@ class MavlinkLink:
             return done
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._closed.set()
         self._thread.join()
         self._transport.close()
@@ -111,7 +111,7 @@ class MavlinkLink:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        """End the connection."""
+        """Close the connection."""
         self.close()
 
     def _run(self) -> None:
@@ -157,7 +157,7 @@ class MavlinkLink:
         )
 
     def _attempt(self, what: str, act: Callable[[], object]) -> bool:
-        """Do something that may fail because of the connection; tell once when it does, and once when it works."""
+        """Attempt something that may fail with the connection; report the first failure and the recovery."""
         try:
             act()
         except OSError as error:

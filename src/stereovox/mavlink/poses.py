@@ -20,50 +20,50 @@ from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.sources.poses.tracker import turned
 
 LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
-"""MAV_FRAME: the worlds and the body of ODOMETRY that are understood."""
+"""MAV_FRAME: the supported worlds and body of ODOMETRY."""
 BODIES = (BODY_FRD, 8)
-"""The child frame is that of the velocities, which are not used; 8, MAV_FRAME_BODY_NED, is an older name."""
+"""The child frame is the velocities', which are not used; 8, MAV_FRAME_BODY_NED, is an older name."""
 ATTITUDES = 16
-"""Last attitudes that are remembered: a position may come before or after the attitudes of its time."""
+"""Number of latest attitudes kept: a position may arrive before or after the attitudes of its time."""
 LONGEST_GAP_NS = 200_000_000
-"""Between two attitudes, one before and one after a position."""
+"""Longest time between the attitudes before and after a position."""
 OLDEST_NS, NEWEST_NS = 2_000_000_000, 50_000_000
-"""How old a pose may be when it comes, and how far ahead of this machine's clock; else the clocks do not agree."""
+"""Largest age of a pose on arrival, and lead over this machine's clock; beyond, the clocks disagree."""
 PREFERRED_NS = 1_000_000_000
-"""While ODOMETRY, or ATTITUDE_QUATERNION, came within this time, LOCAL_POSITION_NED, or ATTITUDE, is passed over."""
+"""While ODOMETRY, or ATTITUDE_QUATERNION, came within this time, LOCAL_POSITION_NED, or ATTITUDE, is ignored."""
 LONGEST_RESET_NS, RESET_STEPS = 500_000_000, 5
-"""Between the poses before and after a reset, and as a multiple of the time between the two before it: longer, and
-nobody knows where the vehicle went meanwhile."""
+"""Longest time between the poses before and after a reset, also as a multiple of the previous interval: beyond it the
+vehicle's motion is unknown."""
 MAX_LENGTH_ERROR = 0.01
-"""By which the length of a quaternion may differ from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 
 
 class TakesPoses(Protocol):
-    """What poses are handed to, such as `LivePoses`."""
+    """A receiver of poses, such as `LivePoses`."""
 
     def add(self, stamp_ns: int, T_world_body: NDArray[np.float64]) -> object:
-        """Take one pose: T_world_body (4, 4) at a time in nanoseconds."""
+        """Add one pose: T_world_body (4, 4) at a time in nanoseconds."""
         ...
 
 
 class PoseReceiver:
-    """Hands the poses that an autopilot sends to `into`, stamped by this machine's clock.
+    """Passes an autopilot's poses to `into`, stamped by this machine's clock.
 
-    Where ODOMETRY says that the autopilot's estimate was reset (`reset_counter`), the poses after it are shifted and
-    turned about the vertical so that they go on from those before it: what is mapped stays right, in a world that is
-    no longer the autopilot's. So it is reported, and also if too much time passed for that.
+    When ODOMETRY reports a reset of the autopilot's estimate (`reset_counter`), later poses are shifted and turned
+    about the vertical so that they continue the earlier ones: the map stays right, in a world that is no longer the
+    autopilot's. This is reported, and so is a gap too long to do it.
 
     Args:
-        connection: A `MavlinkLink`, or the address of one, which is then closed with the receiver.
-        into: Its `add(stamp_ns, T_world_body)` is called by the thread that reads. T_world_body (4, 4) maps the
+        connection: A `MavlinkLink`, or the address of one, which is closed with the receiver.
+        into: Its `add(stamp_ns, T_world_body)` is called by the reading thread. T_world_body (4, 4) maps the
             vehicle's body (optical axes: x right, y down, z forward) into a world x north, y west, z up, with the
-            autopilot's origin, or the one it had before a reset. stamp_ns: when the vehicle was there, by the clock of
+            autopilot's origin, or its origin before a reset. stamp_ns: time of the pose, by the clock of
             the link.
-        tell: Called with one line when poses cannot be used, why, once for each reason.
+        tell: Called with one line, once per reason, when poses cannot be used.
 
     Attributes:
-        taken: Poses handed on so far.
-        passed_over: Poses that were not, by reason.
+        taken: Number of poses passed on.
+        passed_over: Number of other poses, by reason.
         link: The connection.
 
     Raises:
@@ -92,7 +92,7 @@ class PoseReceiver:
         self.link.listen(self._take)
 
     def close(self) -> None:
-        """Take no more poses, and close the connection unless it was given."""
+        """Stop receiving poses, and close the connection unless it was given."""
         self.link.ignore(self._take)
         if self._own:
             self.link.close()
@@ -102,7 +102,7 @@ class PoseReceiver:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        """Take no more poses."""
+        """Stop receiving poses."""
         self.close()
 
     def _take(self, message: Any, came_ns: int) -> None:
@@ -145,7 +145,7 @@ class PoseReceiver:
         self._combine()
 
     def _combine(self) -> None:
-        """Make a pose of the position that waits, once there is an attitude of its time or later."""
+        """Combine the waiting position with an attitude, once one of its time or later is there."""
         if self._position is None or not self._attitudes or self._attitudes[-1][0] < self._position[0]:
             return
         (at_ns, xyz, came_ns), self._position = self._position, None
@@ -184,7 +184,7 @@ class PoseReceiver:
         self._into.add(stamp_ns, T_world_body)
 
     def _go_on(self, stamp_ns: int, T_autopilot_body: Transform) -> None:
-        """Take the body for where it would be without the reset, and turned so about the vertical."""
+        """Continue from the pose expected without the reset, including the turn about the vertical."""
         words, expected = "the autopilot's position was reset", self._expected(stamp_ns)
         if expected is None:
             self._tell(f"{words}: poses jump, and what is mapped stays where it is")
@@ -196,7 +196,7 @@ class PoseReceiver:
         self._tell(f"{words}: poses go on from those before it")
 
     def _expected(self, stamp_ns: int) -> Transform | None:
-        """Return where the body is if it went on as between its last two poses, None if that is long ago."""
+        """Return the pose extrapolated from the last two, None if they are too old."""
         if len(self._recent) < 2:
             return None
         (first_ns, first), (then_ns, then) = self._recent
@@ -212,15 +212,15 @@ class PoseReceiver:
 
 
 def receive_poses(connection: str | MavlinkLink, into: TakesPoses, *, tell: Tell = warn) -> PoseReceiver:
-    """Hand the poses that an autopilot sends to `into` until the receiver is closed; see `PoseReceiver`.
+    """Pass an autopilot's poses to `into` until the receiver is closed; see `PoseReceiver`.
 
     Args:
         connection: A `MavlinkLink`, or the address of one.
-        into: What takes them.
+        into: Receiver of the poses.
         tell: Called with one line when poses cannot be used.
 
     Returns:
-        The receiver, already at work.
+        The receiver, already running.
 
     Raises:
         StereovoxError: As for `MavlinkLink`.
@@ -229,7 +229,7 @@ def receive_poses(connection: str | MavlinkLink, into: TakesPoses, *, tell: Tell
 
 
 def _pose(xyz: list[float], wxyz: list[float]) -> Transform | None:
-    """Return the motion of a position and a quaternion w, x, y, z; None if they are no such thing."""
+    """Return the motion of a position and a quaternion w, x, y, z; None if they are invalid."""
     w, x, y, z = wxyz
     if not all(map(isfinite, (*xyz, *wxyz))) or abs(np.linalg.norm(wxyz) - 1) > MAX_LENGTH_ERROR:
         return None
@@ -237,7 +237,7 @@ def _pose(xyz: list[float], wxyz: list[float]) -> Transform | None:
 
 
 def _of_angles(roll: float, pitch: float, yaw: float) -> Transform | None:
-    """Return the rotation of a body that is turned by yaw, then pitch, then roll, radians about its own axes."""
+    """Return the rotation by yaw, then pitch, then roll, in radians about the body's own axes."""
     if not all(map(isfinite, (roll, pitch, yaw))):
         return None
     half = [(cos(a / 2), sin(a / 2)) for a in (roll, pitch, yaw)]

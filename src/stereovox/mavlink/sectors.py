@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MAVLink's OBSTACLE_DISTANCE says of a map: how far 72 sectors round a vehicle are known to be free.
+"""MAVLink's OBSTACLE_DISTANCE from a map: the known free distance in 72 sectors around a vehicle.
 
-The message (https://mavlink.io/en/messages/common.html#OBSTACLE_DISTANCE): whole centimetres; element i lies at
+The message (https://mavlink.io/en/messages/common.html#OBSTACLE_DISTANCE): whole centimetres; element i is at
 `angle_offset + i * increment` degrees, clockwise seen from above, from the vehicle's front in MAV_FRAME_BODY_FRD;
-`max_distance + 1` says that there is no obstacle, UINT16_MAX that nothing is known. What its readers make of it decides
-how it is filled here:
+`max_distance + 1` means no obstacle, UINT16_MAX unknown. The behaviour of its readers decides how it is filled here:
+
 
 - PX4 1.14 has sectors of 10 degrees and takes element `ceil(angle / increment)` for each, every second one of 72
   (CollisionPrevention.cpp, `_addObstacleSensorData`). Elements therefore overlap (`overlap_deg`).
-- PX4 does not look at elements up to `min_distance`, and ArduPilot neither at these nor at 0 (AP_Proximity_MAV.cpp,
-  `handle_obstacle_distance_msg`): what is nearest would count as nothing. `min_distance` is therefore 0 and an obstacle
-  that touches the vehicle at 1 cm.
-- UINT16_MAX leaves PX4's sector as it was for up to 0.5 s, during which the vehicle may turn; then it does not fly
-  there (`CP_GO_NO_DATA` = 0). ArduPilot takes it for free. The default is therefore to say where the unknown begins, as
-  if an obstacle stood there; both stop before it.
+- PX4 ignores elements up to `min_distance`, and ArduPilot ignores these and 0 (AP_Proximity_MAV.cpp,
+  `handle_obstacle_distance_msg`): the nearest obstacle would not count. `min_distance` is therefore 0 and an obstacle
+  that touches the vehicle is at 1 cm.
+- UINT16_MAX leaves PX4's sector unchanged for up to 0.5 s, during which the vehicle may turn; then it does not fly
+  there (`CP_GO_NO_DATA` = 0). ArduPilot treats it as free. The default is therefore to send where the unknown begins,
+  as if an obstacle were there; both stop before it.
 - PX4 turns elements by the vehicle's yaw only, so sectors are level, whatever its roll and pitch.
 """
 
@@ -34,11 +34,11 @@ from stereovox.products.floor.floor_axes import up_of, upright_axes
 SECTORS = 72
 INCREMENT_DEG = 360 / SECTORS
 UNKNOWN = 0xFFFF
-"""UINT16_MAX: nothing is known."""
+"""UINT16_MAX: unknown."""
 NEAREST_CM = 1
-"""Least distance that is sent: 0 is passed over by ArduPilot, and by PX4 where it is `min_distance`."""
+"""Least distance sent: ArduPilot ignores 0, and so does PX4 if it is `min_distance`."""
 MAX_CELLS = 20_000_000
-"""Cells that are looked at for one message."""
+"""Most cells inspected for one message."""
 LEVEL_ERROR = 0.02
 """Length by which the map's `up` may miss its true direction (1.1 degrees)."""
 STEEPEST = 0.1
@@ -48,18 +48,18 @@ UnknownAs = Literal["obstacle", "unmeasured"]
 
 @dataclass(frozen=True)
 class SectorRules:
-    """How a map is read for sectors.
+    """Rules for reading sectors from a map.
 
     Attributes:
-        max_distance: Horizontal metres up to which cells are looked at, at most 655.
+        max_distance: Horizontal metres up to which cells are inspected, at most 655.
         half_height: Metres above and below the body's origin within which cells count; more than the vehicle reaches,
             roll and pitch included.
         overlap_deg: Degrees by which each sector reaches into its neighbours on either side, 0 to 45.
-        own_radius: Horizontal metres about the body within which unknown and tentative cells are taken for the
-            vehicle's own place. A camera does not see them before take-off; later none comes as near without being
-            known, since the vehicle stops before the unknown. What is occupied there counts.
+        own_radius: Horizontal metres around the body within which unknown and tentative cells count as the vehicle's
+            own place. A camera does not see them before take-off; later no unknown cell gets this near, because the
+            vehicle stops before the unknown. Occupied cells there count.
         oldest_s: Free cells whose last evidence is older count as unknown (needs `map.keep_times`); infinite: none.
-        unknown: What stands for unknown space before an obstacle: `obstacle`, the distance at which it begins;
+        unknown: Value for unknown space before an obstacle: `obstacle`, the distance at which it begins;
             `unmeasured`, UINT16_MAX.
 
     Raises:
@@ -89,7 +89,7 @@ class SectorRules:
 
 
 class Sectors(NamedTuple):
-    """What a map says about sectors. Sector i is centred at 5 i degrees clockwise of the vehicle's front.
+    """The sectors of a map. Sector i is centred at 5 i degrees clockwise of the vehicle's front.
 
     Attributes:
         obstacle_m: (72,) float64 horizontal metres from the body's origin to the nearest cell that is occupied, or
@@ -102,14 +102,14 @@ class Sectors(NamedTuple):
 
     @property
     def free_m(self) -> NDArray[np.float64]:
-        """(72,) float64 metres up to which everything is known to be free; infinite: up to `max_distance`."""
+        """(72,) float64 metres of known free space; infinite: up to `max_distance`."""
         return np.minimum(self.obstacle_m, self.unknown_m)
 
     def centimetres(self, rules: SectorRules) -> NDArray[np.uint16]:
         """Return the message's `distances` (72,), rounded down.
 
         Args:
-            rules: Those that the sectors were made with.
+            rules: The rules that the sectors were made with.
         """
         free_m = self.free_m
         whole = np.floor(100 * np.minimum(free_m, rules.max_distance) + 1e-6)
@@ -128,21 +128,21 @@ class Heading(NamedTuple):
 
 
 def obstacle_sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: SectorRules | None = None) -> Sectors:
-    """Return how far the sectors round a body are known to be free.
+    """Return the known free distance in sectors around a body.
 
     A cell counts in all sectors that it reaches into, with the distance of its nearest point.
 
     Args:
         voxel_map: The map, with `up` along one of its axes.
         T_world_body: (4, 4) maps the body (optical axes: x right, y down, z forward) into the world.
-        rules: What is looked at; by default `SectorRules()`.
+        rules: What to inspect; by default `SectorRules()`.
 
     Returns:
         The nearest obstacle and the nearest unknown of each sector.
 
     Raises:
-        StereovoxError: The pose is no rigid motion or looks straight up or down, the map is tilted, or there are too
-            many cells to look at.
+        StereovoxError: The pose is not rigid or looks straight up or down, the map is tilted, or there are too
+            many cells to inspect.
     """
     rules = rules or SectorRules()
     heading, cell = heading_of(voxel_map, T_world_body), np.asarray(voxel_map.config.cell)
@@ -158,7 +158,7 @@ def obstacle_sectors(voxel_map: VoxelMap, T_world_body: Transform, rules: Sector
 
 
 def heading_of(voxel_map: VoxelMap, T_world_body: Transform) -> Heading:
-    """Return where a body looks in the map's horizontal plane; raises StereovoxError as `obstacle_sectors` does."""
+    """Return a body's heading in the map's horizontal plane; raises StereovoxError as `obstacle_sectors` does."""
     if not rigidity_error(T_world_body) < 1e-3:
         raise StereovoxError("T_world_body is no rigid motion (4, 4); give a rotation and metres")
     axes = upright_axes(voxel_map.config.up)
@@ -172,7 +172,7 @@ def heading_of(voxel_map: VoxelMap, T_world_body: Transform) -> Heading:
 
 
 class _Columns:
-    """Columns of cells as they lie round a body: distance and bearings of each, all (n, m)."""
+    """Columns of cells around a body: distance and bearings of each, all (n, m)."""
 
     def __init__(
         self,
@@ -201,7 +201,7 @@ class _Columns:
         row, column = np.nonzero(chosen & self._within)
         away = self._away[row, column]
         first, last = self._reach(row, column)
-        first[away == 0], last[away == 0] = 0, SECTORS - 1  # all round
+        first[away == 0], last[away == 0] = 0, SECTORS - 1  # all sectors
         found = np.full(SECTORS, inf)
         for step in range(int((last - first).max(initial=-1)) + 1):
             reached = first + step <= last
@@ -209,7 +209,7 @@ class _Columns:
         return found
 
     def _reach(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the first and last sector, not wrapped, that columns reach into."""
+        """Return the first and last sector, not wrapped, that each column overlaps."""
         x, y = self._x[:, row, 0], self._y[:, 0, column]
         middle = self._bearing_deg(x.mean(axis=0), y.mean(axis=0))
         corners = np.stack([self._bearing_deg(x[i], y[j]) for i in (0, 1) for j in (0, 1)])
@@ -227,7 +227,7 @@ class _Columns:
 def _spans(
     origin: NDArray[np.float64], cell: NDArray[np.float64], upright: list[int], rules: SectorRules
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the lowest and highest cell (3,) that is looked at, in the map's axes."""
+    """Return the lowest and highest cell (3,) to inspect, in the map's axes."""
     reach = np.full(3, rules.max_distance)
     reach[upright[2]] = rules.half_height
     low = np.floor((origin - reach) / cell).astype(np.int64)
@@ -237,7 +237,7 @@ def _spans(
 
 
 def check_number_of_cells(low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
-    """Raise StereovoxError if a box of cells is too large to be looked at for each message."""
+    """Raise StereovoxError if a box of cells is too large to inspect for each message."""
     number = np.prod((high - low + 1).astype(float))
     if number > MAX_CELLS:
         raise StereovoxError(f"{number:.0f} cells for one message; lessen max_distance, or map with larger cells")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Obstacle distances of a growing map for an autopilot, at a steady rate, and none once the map is stale."""
+"""Obstacle distances from a growing map to an autopilot, at a steady rate, and none once the map is stale."""
 
 from __future__ import annotations
 
@@ -20,51 +20,52 @@ from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
 
 T_BODY_LIDAR = np.eye(4)
-"""Where a lidar is that is not named: at the body's origin, looking ahead."""
+"""Default mount of a lidar: at the body's origin, facing ahead."""
 T_BODY_LIDAR[:3, :3] = R_SENSOR_OPTICAL.T
 T_BODY_LIDAR.setflags(write=False)
 HIGHEST_RATE_HZ = 200.0
 PATIENCE = 0.5
 """Share of a period for which a message waits for the next frame."""
 POSE_SHARE = 0.6
-"""How old the body's pose may be, as a share of what its map may be: the body moves, most of what it sees does not."""
+"""Largest age of the body's pose, as a share of the map's: the body moves, most of the scene does not."""
 
 
 class ObstacleSender:
-    """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D where that is asked for.
+    """Sends OBSTACLE_DISTANCE of a mapper's map, and OBSTACLE_DISTANCE_3D if requested.
 
-    It is an `Observer` for `map_recording`, and `after` may be called next to any `Mapper.add`. A thread of its own
-    reads the map; each message is for where the body is by its newest pose, of a frame that the map took in (`after`,
-    `at`) or without one (`pose`), carried on to the present by the motion between the last two. It waits up to half a
-    period for the next frame. Unknown space ends what is free, as `SectorRules.unknown` says.
+    It is an `Observer` for `map_recording`, and `after` may be called next to any `Mapper.add`. Its own thread reads
+    the map; each message is for the body's present place: its newest pose, from a frame in the map (`after`, `at`) or
+    without one (`pose`), extrapolated by the motion between the last two. It waits up to half a period for the next
+    frame. Unknown space ends free space, as `SectorRules.unknown` sets.
 
-    Nothing is sent before the first frame, nor once any camera's newest frame shows what was more than `max_age_s` ago
-    or the newest pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot reports its
-    sensor as failed. Ages are counted from the event, by its stamp (`Mapper.stamp_clock`, which becomes "live" unless
-    it was set), and at least from its arrival. After the body's pose has jumped nothing is sent until the map took in a
-    frame from there.
 
-    `time_usec` and `time_boot_ms` are when the oldest of the cameras' newest frames was taken, by this machine's clock,
-    which the autopilot may ask for (TIMESYNC). A map whose layers are not level is refused: nothing is sent.
+    Nothing is sent before the first frame, nor once any camera's newest frame is older than `max_age_s` or the newest
+    pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as
+    failed. Ages count from the event, by its stamp (`Mapper.stamp_clock`, which becomes "live" unless set), and at
+    least from its arrival. After a jump of the body's pose nothing is sent until a frame from there is in the map.
+
+
+    `time_usec` and `time_boot_ms` are the time of the oldest of the cameras' newest frames, by this machine's clock,
+    which the autopilot may request (TIMESYNC). A map whose layers are not level is refused: nothing is sent.
 
     Args:
         mapper: The mapper whose map is sent.
-        connection: A `MavlinkLink`, or the address of one, which is then closed with the sender.
-        rate_hz: Messages a second. PX4 was tested with 10. None: there is no thread, and nothing is sent but by `send`.
-        max_age_s: Seconds since what the newest frame shows after which nothing is sent.
-        rules: What OBSTACLE_DISTANCE says; by default `SectorRules()`.
-        directions: What OBSTACLE_DISTANCE_3D says; None: it is not sent.
+        connection: A `MavlinkLink`, or the address of one, which is closed with the sender.
+        rate_hz: Messages a second. PX4 was tested with 10. None: no thread; only `send` sends.
+        max_age_s: Age of the newest frame's content in seconds above which nothing is sent.
+        rules: Rules of OBSTACLE_DISTANCE; by default `SectorRules()`.
+        directions: Rules of OBSTACLE_DISTANCE_3D; None: it is not sent.
         mounts: T_body_sensor (4, 4) by the name of the sensor: maps a camera's optical frame into the body in optical
-            axes (x right, y down, z forward); of a lidar its own frame (x forward, y left, z up). One that is not named
-            looks ahead from the body's origin.
-        tell: Called with one line when sending stops, why, and when it goes on.
+            axes (x right, y down, z forward); for a lidar its own frame (x forward, y left, z up). One that is not
+            named faces ahead at the body's origin.
+        tell: Called with one line when sending stops, with the reason, and when it resumes.
 
     Attributes:
-        sent: Number of OBSTACLE_DISTANCE messages so far.
+        sent: Number of OBSTACLE_DISTANCE messages sent.
         link: The connection.
 
     Raises:
-        StereovoxError: A value is out of range, a mount is no rigid motion, or as for `MavlinkLink`.
+        StereovoxError: A value is out of range, a mount is not rigid, or as for `MavlinkLink`.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class ObstacleSender:
             self._thread.start()
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Take the pose of a frame that the map took in.
+        """Use the pose of a frame that entered the map.
 
         Args:
             frame: The frame that was offered to the mapper.
@@ -113,13 +114,13 @@ class ObstacleSender:
         self.at(T_world_body, frame.sensor, stamp_ns=frame.stamp_ns or None)
 
     def at(self, T_world_body: Transform, sensor: str, waited_s: float = 0.0, stamp_ns: int | None = None) -> None:
-        """Take the pose of the body by a frame that the map took in; `after` does, by the mounts.
+        """Use the body's pose from a frame that entered the map; `after` calls it, using the mounts.
 
         Args:
             T_world_body: (4, 4) maps the body (optical axes) into the world.
-            sensor: Name of what took the frame.
-            waited_s: Seconds from when it arrived until the map took it in; it is as much older.
-            stamp_ns: The frame's; None: that of the last frame that the map took in.
+            sensor: Name of the frame's sensor.
+            waited_s: Seconds from its arrival to its entry into the map, added to its age.
+            stamp_ns: The frame's; None: the stamp of the last frame in the map.
         """
         self._waited_s[sensor] = waited_s
         taken_ns = self._mapper.health().stamp_ns if stamp_ns is None else stamp_ns
@@ -127,19 +128,19 @@ class ObstacleSender:
         self._new.set()
 
     def pose(self, stamp_ns: int, T_world_body: Transform) -> None:
-        """Take a pose of the body that came now, without a frame.
+        """Use a pose of the body that arrived now, without a frame.
 
         Args:
             stamp_ns: Its time, by the clock of the frames' stamps.
-            T_world_body: (4, 4) maps the body (optical axes) into the world. One that is not finite or no rigid motion
-                says that nobody knows where the body is, and is left out.
+            T_world_body: (4, 4) maps the body (optical axes) into the world. One that is not finite or not rigid
+                means that the pose is unknown, and is ignored.
         """
         self._mapper.heard(stamp_ns)
         if np.isfinite(T_world_body).all() and rigidity_error(T_world_body) < 1e-3:
             self._body.take(BodyPose(int(stamp_ns), self._mapper.now_ns(), T_world_body))
 
     def finish(self) -> None:
-        """Do nothing: what is sent ends when it is stale, or with `close`."""
+        """Do nothing: sending stops when the map is stale, or with `close`."""
 
     def close(self) -> None:
         """Stop sending, and close the connection unless it was given."""
@@ -169,16 +170,14 @@ class ObstacleSender:
             due = max(due + self._period_s, monotonic() - self._period_s)
 
     def send(self) -> str:
-        """Send what the map says now, and tell the user when that begins or ends to fail; the thread calls it.
+        """Send the current distances, and report when that starts or stops failing; called by the thread.
 
         Returns:
-            Why nothing was sent; "": it was, or nothing has come yet.
+            Why nothing was sent; "" if it was, or no frame has arrived yet.
         """
         try:
             why = self._send()
-        except (
-            Exception
-        ) as error:  # whatever is wrong, nothing is sent, the user is informed, and the next try may succeed
+        except Exception as error:  # on any error nothing is sent, the user is informed, and the next try may succeed
             why = f"{type(error).__name__}: {error}" if not isinstance(error, StereovoxError) else str(error)
         if bool(why) != bool(self._why):
             self._tell(f"no obstacle distances are sent: {why}" if why else "obstacle distances are sent again")
@@ -186,10 +185,10 @@ class ObstacleSender:
         return why
 
     def _send(self) -> str:
-        """Send what the map says now; return why not, nothing if it was sent."""
+        """Send the current distances; return why not, or "" if sent."""
         health, newest = self._mapper.health(), self._body.newest
         if newest is None or not health.ages_s:
-            return ""  # nothing has come yet, which is no news
+            return ""  # nothing has arrived yet: not worth a report
         ages_s = {sensor: age_s + self._waited_s.get(sensor, 0.0) for sensor, age_s in health.ages_s.items()}
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
         if age_s > self._max_age_s:
@@ -224,7 +223,7 @@ class ObstacleSender:
         )  # fmt: skip
 
     def _places(self, T_world_body: Transform, seen_ns: int) -> list[Any]:
-        """Return the messages of all directions; made before the first is sent, since they must come close together."""
+        """Return the messages of all directions; all made before sending, because they must arrive close together."""
         if self._directions is None:
             return []
         m, farthest = self.link.messages, self._directions.max_distance
@@ -238,7 +237,7 @@ class ObstacleSender:
 
 
 def _checked_mounts(mounts: Mapping[str, Transform]) -> dict[str, Transform]:
-    """Return the mounts as arrays; raises StereovoxError for one that is no rigid motion."""
+    """Return the mounts as arrays; raises StereovoxError for one that is not rigid."""
     for sensor, mount in mounts.items():
         if not rigidity_error(mount) < 1e-3:
             raise StereovoxError(f"mounts['{sensor}'] is no rigid motion (4, 4); give T_body_sensor")

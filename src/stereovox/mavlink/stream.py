@@ -16,10 +16,10 @@ PREFIX = "mavlink:"
 
 
 class MavlinkPoses(PoseStream):
-    """ODOMETRY, or LOCAL_POSITION_NED with attitudes, of an autopilot, in time by TIMESYNC.
+    """ODOMETRY, or LOCAL_POSITION_NED with attitudes, of an autopilot, synchronised by TIMESYNC.
 
     where: `mavlink:` and an address of `MavlinkLink`. Stamps are nanoseconds since 1970 by this machine's clock, which
-    cameras stamp by as well. World x north, y west, z up; body x forward, y left, z up. See `PoseReceiver`.
+    cameras also use. World x north, y west, z up; body x forward, y left, z up. See `PoseReceiver`.
 
     Attributes:
         url: The address.
@@ -37,19 +37,19 @@ class MavlinkPoses(PoseStream):
 
     @cached_property
     def link(self) -> MavlinkLink:
-        """The connection, opened when it is first asked for; obstacle distances may go over it as well."""
+        """The connection, opened on first use; obstacle distances may use it too."""
         try:
             return MavlinkLink(self.url, clock=epoch_ns, tell=self._note)
         except StereovoxError as error:
             raise SourceError(str(error)) from None
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         self._receiver = PoseReceiver(self.link, self, tell=self._note)
         super().start()
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         super().stop()
         if self._receiver is not None:
             self._receiver.close()
@@ -59,7 +59,7 @@ class MavlinkPoses(PoseStream):
             self.link.close()
 
     def add(self, stamp_ns: int, T_world_body: Transform) -> None:
-        """Take in a pose of the body in optical axes."""
+        """Add a pose of the body in optical axes."""
         self.poses.add(stamp_ns, T_world_body @ T_OPTICAL_BODY)
 
     def _receive(self) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bytes to and from an autopilot: `udpout:HOST:PORT`, `udpin:HOST:PORT`, `tcp:HOST:PORT`, `serial:DEVICE:BAUD`.
 
-pymavlink's own connections choose the protocol's version by an environment variable of the whole process; these do not.
+pymavlink's own connections choose the protocol version by a process-wide environment variable; these do not.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
 class Transport(Protocol):
-    """A way for bytes; one thread reads, another may write meanwhile."""
+    """A byte channel; one thread reads, another may write meanwhile."""
 
     def read(self, seconds: float) -> bytes:
-        """Return what came within so many seconds; nothing if nothing did. Raises OSError if the way is gone."""
+        """Return bytes that arrived within `seconds`, possibly none. Raises OSError if the channel is gone."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; datagrams may be lost. Raises OSError if the way is gone."""
+        """Send bytes; datagrams may be lost. Raises OSError if the channel is gone."""
         ...
 
     def close(self) -> None:
-        """End it; a `read` in another thread returns soon."""
+        """Close it; a `read` in another thread returns soon."""
         ...
 
 
 def open_transport(url: str) -> Transport:
-    """Return the way to an autopilot that a text names; raises StereovoxError for others and if there is none."""
+    """Return the channel to an autopilot given by `url`; raises StereovoxError if invalid or unreachable."""
     kind, _, rest = url.partition(":")
     place, _, number = rest.rpartition(":")
     if kind not in {"udpout", "udpin", "tcp", "serial"} or not place or not number.isdecimal() or len(number) > 9:
@@ -54,16 +54,16 @@ def open_transport(url: str) -> Transport:
 
 
 class Reopened:
-    """A way that breaks, such as a cable that is pulled out, and is then opened anew, tried once a second.
+    """A channel that reopens after a break, such as a pulled cable, trying once a second.
 
-    open: returns the way; what it raises the first time is raised.
+    open: returns the channel; its first error is raised.
     """
 
     def __init__(self, open: Callable[[], Transport]):
         self._open, self._way, self._due_s, self._broken = open, open(), 0.0, False
 
     def read(self, seconds: float) -> bytes:
-        """Return what came; open the way anew where it broke."""
+        """Return bytes that arrived; reopen the channel if it broke."""
         if self._broken:
             if monotonic() < self._due_s:
                 raise ConnectionError("the connection is gone")
@@ -83,7 +83,7 @@ class Reopened:
         self._way.write(data)
 
     def close(self) -> None:
-        """End the way."""
+        """Close the channel."""
         self._way.close()
 
     def _opened(self) -> Transport:
@@ -94,7 +94,7 @@ class Reopened:
 
 
 class UdpTransport:
-    """Datagrams. udpin: listens, and answers whoever was heard last; udpout: sends to one address."""
+    """Datagrams. udpin: listens, and answers the last sender; udpout: sends to one address."""
 
     def __init__(self, kind: str, host: str, port: int):
         address = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4]
@@ -117,14 +117,14 @@ class UdpTransport:
         self._socket.settimeout(seconds)
         try:
             data, sender = self._socket.recvfrom(MAX_DATAGRAM)
-        except (TimeoutError, ConnectionRefusedError):  # refused: nobody listens at the other end yet
+        except (TimeoutError, ConnectionRefusedError):  # refused: the other end is not listening yet
             return b""
         if self._follow:
             self._peer = sender
         return data
 
     def write(self, data: bytes) -> None:
-        """Send one datagram; without anybody to send it to, none."""
+        """Send one datagram, if the receiver is known."""
         if self._peer is not None:
             with suppress(ConnectionRefusedError, BlockingIOError, TimeoutError):
                 self._socket.sendto(data, self._peer)
@@ -142,7 +142,7 @@ class TcpTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self, seconds: float) -> bytes:
-        """Return what came."""
+        """Return bytes that arrived."""
         self._socket.settimeout(seconds)
         try:
             data = self._socket.recv(MAX_DATAGRAM)
@@ -177,7 +177,7 @@ class SerialTransport:
             ) from None
 
     def read(self, seconds: float) -> bytes:
-        """Return what came."""
+        """Return bytes that arrived."""
         self._port.timeout = seconds
         return self._port.read(max(1, self._port.in_waiting))
 

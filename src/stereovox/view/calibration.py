@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of calibrations: walls before and after a correction, noise by distance and next to theory."""
+"""Pictures of calibrations: walls before and after a correction, noise by distance with theory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereovox.view.panels import GREY, title
 
 DPI = 150
 WIDTH = 11.0
-"""Inches: the width at which a page shows it, so that letters keep their size."""
+"""Inches: the width on a page, so that letters keep their size."""
 LETTERS = 10
 """Size of the numbers along an axis, in points."""
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
@@ -28,7 +28,7 @@ ERRORS = (
 )
 DOTS = 6000
 BAND = 0.1
-"""Share of the rows used in a top view, since a tilted wall would blur it."""
+"""Share of the rows used in a top view, because a tilted wall would blur it."""
 
 
 def wall_png(calibration: WallCalibration) -> bytes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Picture of missions: the share of the air that is known to be free, over time."""
+"""Picture of missions: the share of the air known to be free, over time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def coverage_figure(flights: Sequence[dict[str, Any]]) -> Any:
     """Return a figure with a panel for each scene: a grey line for each flight, the median of all in black.
 
     flights: with `scene`, `seconds` and `coverage` [[seconds, share], ...]. A flight that ended keeps its last share;
-    a red cross marks where one touched something.
+    a red cross marks a collision.
     """
     scenes = list(dict.fromkeys(flight["scene"] for flight in flights))
     longest = max(flight["coverage"][-1][0] for flight in flights)

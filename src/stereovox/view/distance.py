@@ -25,8 +25,8 @@ def picture_distance(
 ) -> None:
     """Write a PNG of the layer across `up` at height `at_m` in metres along it, by default the middle of the box.
 
-    Obstacles are dark; contours join places of equal distance. Raises StereovoxError for a height outside the box, and
-    as `figures.save` does.
+    Obstacles are dark; contours connect places of equal distance. Raises StereovoxError for a height outside the box,
+    and as `figures.save` does.
     """
     save(draw_distance(field, up, at_m, title), path)
 

@@ -21,9 +21,9 @@ WIDTH = 16.0
 
 
 def keep_clear(axis: Any) -> None:
-    """Move the legend above a panel into a column at its right where it would cover the panel's title.
+    """Move the legend above a panel into a column at its right if it would cover the panel's title.
 
-    Call it when all panels of the figure are there: the width of this one is known only from the finished layout.
+    Call it once all panels of the figure exist: only the finished layout determines this one's width.
     """
     axis.figure.draw_without_rendering()
     legend = axis.get_legend()
@@ -106,7 +106,7 @@ def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:
 def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
     """Save a figure as pixels (.png) or vectors with text as text (.pdf, .svg).
 
-    dpi: dots per inch; by default the figure's own. In .pdf and .svg it is that of cells drawn as an image.
+    dpi: dots per inch; by default the figure's own. In .pdf and .svg it applies to cells drawn as an image.
     Raises StereovoxError for another suffix, an invalid dpi, or a file that cannot be written.
     """
     from matplotlib import rc_context

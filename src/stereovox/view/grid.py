@@ -98,7 +98,7 @@ def paint(
 ) -> None:
     """Draw classes (rows, columns) uint8 of the cells of `grid` into a panel.
 
-    colours: of each class; where one pixel stands for several cells the last class in this order is shown, so that a
+    colours: of each class; if one pixel covers several cells the last class in this order is shown, so that a
     wall one cell wide is not lost. max_px: pixels along the longer side.
     """
     from matplotlib.colors import ListedColormap
@@ -123,7 +123,7 @@ def paint(
 
 
 def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDArray[np.uint8]:
-    """Return, for each square of `step` by `step` cells, the index in `rising` of its class that comes last there."""
+    """Return, for each square of `step` by `step` cells, the index in `rising` of its last class in that order."""
     rank = np.zeros(256, np.uint8)
     rank[np.asarray(rising, int)] = np.arange(len(rising))
     rows, columns = (-(-n // step) * step for n in classes.shape)

@@ -32,7 +32,7 @@ KINDS = {
     Difference.WRONGLY_FREE: ("wrongly free", "#8b1e5b"),
     Difference.WRONGLY_OCCUPIED: ("wrongly occupied", "#d1603d"),
 }
-"""Name and colour; where one pixel stands for several cells, the last of these is shown."""
+"""Name and colour; if one pixel covers several cells, the last of these is shown."""
 
 
 def binary_png(laid: AlignedGrids) -> bytes:
@@ -90,7 +90,7 @@ def _is_wide(box: Box) -> bool:
 
 
 def _panels(box: Box, number: int) -> tuple[Any, list[Any]]:
-    """Return a figure with panels side by side or, for wide maps, below each other."""
+    """Return a figure with panels side by side or, for wide maps, stacked."""
     width, height = box[1] - box[0]
     rows, columns = (number, 1) if _is_wide(box) else (1, number)
     inches = float(np.clip(0.93 * WIDTH / columns * height / width, 1.6, 11.0)) + 0.7

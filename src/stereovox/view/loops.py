@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of loop closure: the camera's way before and after, the loops, and the map where poses were most off."""
+"""Pictures of loop closure: trajectory before and after, loops, and the map where poses were most off."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from stereovox.view.panels import HALO, INK, STATE_COLOURS, measured, scale_bar,
 from stereovox.view.scene.above import draw_columns
 
 BEFORE, AFTER, CLOSED, REFUSED = "#969dab", "#2458b8", "#1f9d55", "#c2185b"
-"""Colours of the ways and of loops."""
+"""Colours of the trajectories and of loops."""
 WINDOW_M = 5.0
-"""Metres of the map that are shown from near, and as many more as poses were off there, twice."""
+"""Size in metres of the map's close-up, plus twice the pose error there."""
 LISTED = 6
 """Refused loops whose reasons are listed."""
 ABOVE = 20
-"""Points above its place at which a number stands, and by which it is moved up while another one is there."""
+"""Points of a number above its place, and step by which it moves up to avoid others."""
 LINE_IN = 0.26
 """Inches from one line of text to the next."""
 
 Window = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Lowest and highest corner (2,) in metres of what is shown from near, across the floor."""
+"""Lowest and highest corner (2,) in metres of the close-up, across the floor."""
 
 
 def loops_picture(closure: LoopClosure, after: VoxelMap, file: str | Path, before: VoxelMap | None = None) -> None:
-    """Draw what loop closure found and did.
+    """Draw the result of loop closure.
 
-    From above: the camera's way before (grey) and after (blue), closed loops (green) and refused ones (red, dashed)
-    between their places, with the reasons. Next to it the map where the poses were most off, before and after.
+    From above: the camera's trajectory before (grey) and after (blue), closed loops (green) and refused ones (red,
+    dashed) between their places, with reasons. Next to it the map where the poses were most off, before and after.
 
     Args:
         closure: From `close_loops`.
@@ -79,7 +79,7 @@ def loops_figure(closure: LoopClosure, after: VoxelMap, before: VoxelMap | None 
 
 
 def _panels(closure: LoopClosure, across: Sequence[int], near: Sequence[str], lines: int) -> tuple[Any, dict[str, Any]]:
-    """Return a figure and its panels: the ways at the left, the map from near at the right, words below."""
+    """Return a figure and its panels: the trajectories at the left, the map's close-up at the right, text below."""
     width, depth = np.ptp(_all_places(closure)[:, across], axis=0)
     high = float(np.clip(9.5 * depth / max(width, 1e-9), 4.5 * max(len(near), 1), 11.0))
     low = LINE_IN * (lines + 0.5)
@@ -99,7 +99,7 @@ def _all_places(closure: LoopClosure) -> NDArray[np.float64]:
 
 
 def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> list[Any]:
-    """Draw both ways from above, and the loops; return the numbers of refused ones."""
+    """Draw both trajectories from above, and the loops; return the numbers of refused ones."""
     axis.set_aspect("equal", adjustable="datalim")
     axis.grid(alpha=0.25)
     title(axis, "The camera's way from above")
@@ -107,7 +107,7 @@ def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> list[A
     _draw_way(axis, closure.T_world_sensor, across, AFTER, "way after")
     closed = closure.ends(closure.loops, closure.T_world_before)
     _draw_lines(axis, closed, across, CLOSED, label=f"{len(closed):,} loops closed: one place, seen again")
-    refused = closure.ends(closure.refused, closure.T_world_sensor)  # as their coordinates below
+    refused = closure.ends(closure.refused, closure.T_world_sensor)  # like their coordinates below
     if len(refused):
         _draw_lines(axis, refused, across, REFUSED, "--", f"{len(refused):,} refused: look alike, not believed")
     marks = [_draw_number(axis, ends[1][list(across)], number) for number, ends in enumerate(refused[:LISTED], 1)]
@@ -142,7 +142,7 @@ def _draw_lines(
 
 
 def _draw_number(axis: Any, place: NDArray[np.float64], number: int) -> Any:
-    """Write a number on a disc above a place, over the lines to later ones; return it."""
+    """Write a number on a disc above a place, on top of the lines; return it."""
     return axis.annotate(
         str(number), place, (0, ABOVE), textcoords="offset points", ha="center", va="center",
         fontsize=9.5, weight="bold", color="white", zorder=6 - number / (LISTED + 1),
@@ -152,9 +152,9 @@ def _draw_number(axis: Any, place: NDArray[np.float64], number: int) -> Any:
 
 
 def _move_apart(marks: Sequence[Any], axis: Any) -> None:
-    """Move numbers up that would lie on others: refused loops often lie side by side.
+    """Move overlapping numbers up: refused loops are often close together.
 
-    Call it when all panels are there: where places are on the page is known only from the finished layout.
+    Call it once all panels exist: only the finished layout determines positions on the page.
     """
     axis.figure.draw_without_rendering()
     up, taken = np.array([0.0, ABOVE]), list[NDArray[np.float64]]()
@@ -174,7 +174,7 @@ def _draw_box(axis: Any, window: Window) -> None:
 
 
 def _draw_near(axis: Any, heading: str, voxel_map: VoxelMap, window: Window) -> None:
-    """Draw the columns of a part of a map: dark where they are full."""
+    """Draw the columns of a part of a map: dark if they are full."""
     x, y, *_ = floor_axes(voxel_map.config.up)
     low, high = np.full(3, -np.inf), np.full(3, np.inf)
     low[[x, y]], high[[x, y]] = window
@@ -187,7 +187,7 @@ def _draw_near(axis: Any, heading: str, voxel_map: VoxelMap, window: Window) -> 
 
 
 def _window(closure: LoopClosure, across: Sequence[int]) -> Window:
-    """Return what to show from near: where the two places of a loop stood most wrongly to each other."""
+    """Return the window of the close-up: at the loop whose places were most off relative to each other."""
     pairs = np.array([(loop.first, loop.second) for loop in closure.loops])
     numbers = closure.anchors[pairs]
     between = [

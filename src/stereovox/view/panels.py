@@ -21,7 +21,7 @@ STATE_COLOURS = {
 }
 PATH_COLOUR = "#e0452f"
 HALO = "#fdfdfd"
-"""Rim of a path, which stays white on dark pages."""
+"""Rim of a path, also white on dark pages."""
 
 
 def title(axis: Any, text: str) -> None:
@@ -40,7 +40,7 @@ def view(axis: Any, drawn: Drawn, colours: NDArray[np.floating], direction: Dire
 
 
 def oblique(axis: Any, drawn: Drawn, colours: NDArray[np.floating], direction: Direction, width_px: int) -> None:
-    """Draw a view without axes, with a scale bar and arrows that show where the map's axes point."""
+    """Draw a view without axes, with a scale bar and arrows along the map's axes."""
     view(axis, drawn, colours, direction, width_px)
     axis.set_axis_off()
     left, right = axis.get_xlim()
@@ -63,7 +63,7 @@ def slice_(axis: Any, drawn: Drawn) -> None:
     extent = np.column_stack([low, high]).ravel() * drawn.voxel_size
     colours = ListedColormap([STATE_COLOURS[state] for state in State])
     axis.imshow(image, cmap=colours, vmin=0, vmax=3, origin="lower", extent=extent, interpolation="nearest")
-    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])  # the path may leave what is known
+    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])  # the path may leave known cells
     between = " to ".join(f"{number * drawn.voxel_size:.2f}" for number in (drawn.layer, drawn.layer + 1))
     title(axis, f"Slice at {drawn.names[2]} = {between} m")
     if drawn.path is not None:
@@ -94,7 +94,7 @@ def measured(axis: Any, names: tuple[str, str, str]) -> None:
 
 
 def trajectory(axis: Any, points: NDArray[np.float64], hidden: NDArray[np.bool_] | None = None) -> None:
-    """Draw a path (N, 2) with NaN where it breaks, from a dot to a square; pale where it is `hidden` (N,)."""
+    """Draw a path (N, 2) with NaN at breaks, from a dot to a square; pale where it is `hidden` (N,)."""
     whole = points[np.isfinite(points).all(axis=1)]
     if not len(whole):
         return

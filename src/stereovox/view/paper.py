@@ -55,7 +55,7 @@ def draw_paper(
 ) -> Any:
     """Return a figure `width_mm` wide: `overview` from above, `space` from the side, or the states of a `layer`.
 
-    All show metres, on axes or a scale bar. The camera's path is drawn where the map knows it. at_m, viewpoint: as in
+    All show metres, on axes or a scale bar. The camera's path is drawn if the map has it. at_m, viewpoint: as in
     `draw_view`. Raises StereovoxError for another view, an invalid width, and an empty map.
     """
     from matplotlib import rc_context

@@ -41,9 +41,9 @@ def picture_path(
     """Write a PNG of a path (N, 3) in metres, world frame, of a ball of `radius` metres.
 
     First the map from above, at the heights that the ball passes through; then the vertical section along the path,
-    which shows what it passes over and under; then the distance of obstacles and unknown cells.
+    which shows what is above and below; then the distance of obstacles and unknown cells.
     blocked_at: metres along the path where it is blocked; this point is marked.
-    In the first, a column is free if all of it at these heights is known to be free. Raises as `figures.save`.
+    In the first, a column is free if it is known to be free at all these heights. Raises as `figures.save`.
     """
     save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title, blocked_at), path)
 
@@ -87,7 +87,7 @@ def draw_path(
 def _plan(voxel_map: VoxelMap, band: tuple[float, float], waypoints: NDArray[np.float64]) -> OccupancyGrid:
     """Return the map from above between two heights of its frame, however it is tilted; unknown if nothing is known."""
     side = voxel_map.config.cell[UPS[voxel_map.config.up][2]]
-    below = FloorHeights.level(band[0] - side, voxel_map.config.up)  # the cell of a floor itself does not count
+    below = FloorHeights.level(band[0] - side, voxel_map.config.up)  # the floor's own cell does not count
     found = from_above(voxel_map, (side, band[1] - band[0] + side), below)
     if found is not None:
         return found
@@ -115,7 +115,7 @@ def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float
 
 
 def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:
-    """Draw the states of the cells above and below the path, unrolled, and the space that the body takes."""
+    """Draw the states of the cells above and below the path, unrolled, and the space of the body."""
     from matplotlib.colors import ListedColormap
 
     up = voxel_map.config.up

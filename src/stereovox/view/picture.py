@@ -33,7 +33,7 @@ def picture(
 ) -> None:
     """Write a PNG of a map: top view, three oblique views coloured by height, and a slice with all four states.
 
-    trajectory: camera positions (N, 3) in metres, drawn as a line; by default the path that the map remembers, and none
+    trajectory: camera positions (N, 3) in metres, drawn as a line; by default the path stored in the map, and none
     if it is empty. up: the map's axis that points up (`z`, `-y`, ...). A ceiling is hidden. An empty map gives a
     picture that says so. Raises StereovoxError for an invalid `up`, a name that does not end in .png or a file that
     cannot be written.
@@ -49,7 +49,7 @@ def draw(
     up: str = "z",
     counted: VoxelMap | None = None,
 ) -> Any:
-    """Return the matplotlib figure that `picture` saves; `counted` is the map whose numbers it gives, if another."""
+    """Return the matplotlib figure that `picture` saves; `counted`: the map whose numbers it states, if another."""
     counted, voxel_map = counted or voxel_map, voxel_map.overview()
     drawn = upright(voxel_map, camera_path(voxel_map) if trajectory is None else trajectory, up)
     if not len(drawn.cells):
@@ -63,7 +63,7 @@ def draw(
 
 
 def _about_path(drawn: Drawn) -> list[str]:
-    """Return a fact for the headline: what the line is, and how long."""
+    """Return a fact for the headline: meaning and length of the line."""
     if drawn.path is None or not np.isfinite(drawn.path).any():
         return []
     length = np.nansum(np.linalg.norm(np.diff(drawn.path, axis=0), axis=1))
@@ -87,7 +87,7 @@ def _only_slice(drawn: Drawn) -> Any:
 
 def _page(drawn: Drawn) -> Any:
     solid = drawn.below_ceiling
-    if drawn.path is not None:  # what the panels must hold besides
+    if drawn.path is not None:  # the panels must contain it too
         there = drawn.path[np.isfinite(drawn.path).all(axis=1)]
         solid = np.concatenate([solid, np.floor(there / drawn.voxel_size).astype(np.int32)])
     across, away = np.ptp(extent(solid, 1.0, TOP), axis=0)

@@ -28,7 +28,7 @@ def sphere_picture(
 ) -> None:
     """Write a PNG of the grid: azimuth across (left is left, the middle ahead), elevation upwards.
 
-    now_ns: what ages are counted from (default: the grid's newest). Raises StereovoxError for a name that does not end
+    now_ns: reference time of ages (default: the grid's newest). Raises StereovoxError for a name that does not end
     in .png or a file that cannot be written.
     """
     save(draw_sphere(grid, title, now_ns), path)
@@ -54,7 +54,7 @@ def draw_sphere(grid: SphereGrid, title: str, now_ns: int | None = None) -> Any:
 def panorama(grid: SphereGrid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return ranges in metres and reasons of all directions (polars, azimuths) as a panorama.
 
-    First row: straight up; first column: behind, then left, ahead in the middle, right. Outside of the grid: UNKNOWN.
+    First row: straight up; first column: behind, then left, ahead in the middle, right. Outside the grid: UNKNOWN.
     """
     whole, layout = grid.layout.whole(), grid.layout
     ranges = np.full(whole.shape, np.nan, np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of trajectories: from above, height, errors along the way and by length, and if there is no pose."""
+"""Pictures of trajectories: from above, height, errors along the path and by length, and gaps without a pose."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ AXES = "xyz"
 HEIGHT_IN, ERROR_IN, SEGMENTS_IN = 2.6, 2.6, 3.0
 """Heights of the charts in inches."""
 FEW = 4
-"""Bars that a chart has room for at least."""
+"""Fewest bars that a chart has room for."""
 NO_POSE = "no pose"
 
 Spans = list[tuple[int, int]]
-"""Numbers of the poses before and after each span without a pose."""
+"""Indices of the poses before and after each span without a pose."""
 
 
 def trajectory_picture(score: TrajectoryScore, file: str | Path) -> None:
     """Draw an estimated trajectory next to the true one, and its errors.
 
     From above, along the axis of the truth's frame along which it spreads least; height; position and rotation errors
-    along the way; errors of motions by length (KITTI's rule). Where the estimate has no pose for longer than three of
+    along the path; errors of motions by length (KITTI's rule). If the estimate has no pose for longer than three of
     its usual intervals the truth is drawn in red.
 
     Args:
@@ -81,12 +81,12 @@ def score_figure(score: TrajectoryScore) -> Any:
 
 
 def way_figure(positions: NDArray[np.float64], tracked: NDArray[np.bool_], heading: str) -> Any:
-    """Return a figure of a way without a true one: from above, and its height.
+    """Return a figure of a trajectory without the true one: from above, and its height.
 
     Args:
         positions: (N, 3) metres, z up.
-        tracked: (N,) which of them are known; there is one at least.
-        heading: What it says at the top.
+        tracked: (N,) which of them are known, at least one.
+        heading: Title at the top.
     """
     known = positions[tracked]
     spans = _between_known(tracked)
@@ -110,7 +110,7 @@ def way_figure(positions: NDArray[np.float64], tracked: NDArray[np.bool_], headi
 
 
 def _charts(rows: Sequence[tuple[str, float]], by_length: bool) -> tuple[Any, dict[str, Any]]:
-    """Return a figure, and its charts by name: the rows over all its width, and two for errors by length."""
+    """Return a figure, and its charts by name: full-width rows, and two for errors by length."""
     mosaic = [[name, name] for name, _ in rows] + [["shift", "turn"]] * by_length
     heights = [height for _, height in rows] + [SEGMENTS_IN] * by_length
     figure = blank(WIDTH, sum(heights) + 0.75 * len(heights))
@@ -124,7 +124,7 @@ def _axes(true: NDArray[np.float64]) -> tuple[list[int], int]:
 
 
 def _tall(ground: NDArray[np.float64]) -> float:
-    """Return how many inches high a map of positions (N, 2) is."""
+    """Return the height in inches of a map of positions (N, 2)."""
     width, depth = np.ptp(ground, axis=0)
     return float(np.clip(0.93 * WIDTH * depth / max(width, 1e-9), 2.5, 9.0))
 
@@ -137,7 +137,7 @@ def _gaps(score: TrajectoryScore) -> Spans:
 
 
 def _between_known(tracked: NDArray[np.bool_]) -> Spans:
-    """Return the spans between those that are known, by their numbers among these, in which some are not."""
+    """Return the spans with unknown poses, as indices among the known ones."""
     return [(k, k + 1) for k, (a, b) in enumerate(pairwise(np.flatnonzero(tracked).tolist())) if b > a + 1]
 
 
@@ -152,7 +152,7 @@ def _runs(flags: NDArray[np.bool_]) -> Iterator[slice]:
 
 
 def _along(score: TrajectoryScore) -> tuple[NDArray[np.float64], str]:
-    """Return where each pair is drawn along a chart, and the label of that axis."""
+    """Return each pair's position along a chart, and that axis's label."""
     if score.length_m > MIN_EXTENT_M:
         return travelled_m(score.pairs.T_truth_body), "metres travelled"
     return np.arange(len(score.pairs), dtype=float), "pose"
@@ -166,7 +166,7 @@ def _from_above(axis: Any, flat: Sequence[int]) -> None:
 
 
 def _in_pieces(axis: Any, points: NDArray[np.float64], lost: Spans, label: str = "", **style: Any) -> None:
-    """Draw a line through points (N, 2) that is interrupted if there are none between."""
+    """Draw a line through points (N, 2) that is interrupted at gaps."""
     broken = np.insert(points, [after for _, after in lost], np.nan, axis=0)
     axis.plot(*broken.T, label=label or None, **style)
 

@@ -29,13 +29,13 @@ FRUSTUM_M = 0.15
 """Depth of the small fields of view along the path."""
 MAX_FRUSTA = 60
 FRUSTA_COLOUR = "#2a78c2"
-LOOPS_HINT = "lines between places that were recognised as one (green), or look alike and were not believed to be (red)"
+LOOPS_HINT = "lines between places that were recognised as one (green), or look alike but were rejected (red)"
 
 
 class Cameras:
     """The last camera, the path of all cameras, fields of view along it, loops, and their check boxes.
 
-    The box of loops is there where the map remembers some.
+    The box of loops exists if the map has some.
     """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap):
@@ -54,7 +54,7 @@ class Cameras:
         self.update(voxel_map)
 
     def update(self, voxel_map: VoxelMap) -> None:
-        """Show the cameras of another map, which must not change from now on."""
+        """Show the cameras of another map, which must no longer change."""
         self._map = voxel_map
         viewpoint = voxel_map.viewpoint
         if viewpoint is not None:
@@ -90,13 +90,13 @@ def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> Fra
 
 
 def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
-    """Add a line along the path of each sensor; remove those that the map no longer has."""
+    """Add a line along the path of each sensor; remove paths that the map no longer has."""
     lines = [np.stack([line[:-1], line[1:]], axis=1) for line in voxel_map.history.path.lines()]
     _add_lines(server, "/path/line", np.concatenate([np.empty((0, 2, 3)), *lines]), PATH_COLOUR)
 
 
 def add_loops(server: ViserServer, voxel_map: VoxelMap) -> None:
-    """Add lines between the places of closed and of refused loops; remove those that the map no longer has."""
+    """Add lines between the places of closed and of refused loops; remove lines that the map no longer has."""
     loops = voxel_map.history.loops or LoopLines()
     for name, lines, colour in (("closed", loops.closed, CLOSED), ("refused", loops.refused, REFUSED)):
         _add_lines(server, f"/loops/{name}", lines.ends, colour)
@@ -129,10 +129,10 @@ def _remove(server: ViserServer, name: str) -> None:
 
 
 def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the initial viewpoint of the page and the point it looks at: (3,) each in metres.
+    """Return the initial viewpoint of the page and its target: (3,) each in metres.
 
-    It looks from behind and above the depth camera at the centre of the camera and the occupied cells, or of all cells
-    if none is occupied; a few far outliers do not count.
+    It looks from behind and above the depth camera at the centre of camera and occupied cells, or of all cells
+    if none is occupied; a few far outliers are ignored.
     """
     cells = voxel_map.cells_in(State.OCCUPIED)
     centres = voxel_map.centers(cells if len(cells) else voxel_map.cells()[0])
@@ -154,7 +154,7 @@ def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArr
 
 
 def up_vector(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
-    """Return the unit vector (3,) that points up: the map's own where it is nearest to the axis `up`, else the axis."""
+    """Return the unit vector (3,) that points up: the map's own if it is nearest to the axis `up`, else the axis."""
     config = voxel_map.config
     if config.up_direction is not None and checked_up(config.up) == up:
         return np.array(config.up_direction)

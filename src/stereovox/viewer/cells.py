@@ -29,11 +29,11 @@ TIMELESS = "#8a8f98"
 BESIDE = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
 FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
 DOT = 0.12
-"""Side of the squares that show cells that are not occupied, in cells: small, so that one can see through."""
+"""Side of the squares that show cells that are not occupied, in cells: small, so that they do not block the view."""
 RADII = ((2, 0.4), (4, 1.0))
 """Radii and weights of the ambient occlusion of a cell."""
 MAX_SHADED = 400_000
-"""Most cells whose ambient occlusion is worth the wait: seconds, once a map."""
+"""Most cells whose ambient occlusion is worth the wait: seconds, once per map."""
 GAMMA = 2.2
 LABELS = {
     State.OCCUPIED: "occupied",
@@ -97,17 +97,17 @@ def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> 
 
 
 def brightness(cells: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Return the brightness (N,) of cells (N, 3), less in corners and gaps; of very many cells 1."""
+    """Return the brightness (N,) of cells (N, 3), less in corners and gaps; 1 if there are very many cells."""
     return Occlusion(cells, RADII).mean() if len(cells) <= MAX_SHADED else np.ones(len(cells), np.float32)
 
 
 class Cells:
     """The cells in the scene and their controls.
 
-    kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down of what colours occupied
-    cells. below: slider in metres along `up`; cells above it are hidden. solid: occupied cells (N, 3) that are
-    shown now. scale: mappable for a colour bar, None if no cell is occupied. most: cells of one kind
-    that are in the scene at once, about.
+    kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down of the colouring of
+    occupied cells. below: slider in metres along `up`; cells above it are hidden. solid: occupied cells (N, 3) shown
+    now. scale: mappable for a colour bar, None if no cell is occupied. most: approximate number of cells of one kind in
+    the scene at once.
     """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, max_cells: int = MAX_CELLS):
@@ -131,7 +131,7 @@ class Cells:
         return COLOUR_LABELS[self.colour.value].format(self._up)
 
     def update(self, voxel_map: VoxelMap) -> None:
-        """Show another map with cells of the same size, which must not change from now on."""
+        """Show another map with cells of the same size, which must no longer change."""
         found = {State.OCCUPIED: voxel_map.cells_in(State.OCCUPIED)}
         self._map = voxel_map
         self._found = found
@@ -152,11 +152,11 @@ class Cells:
 
     def _cut(self, _: Any) -> None:
         if not self._fitting:
-            self._touched = True  # the cut stays when the map grows
+            self._touched = True  # the cut is kept when the map grows
             self.draw()
 
     def _fit_slider(self) -> None:
-        """Let the slider reach from the lowest to the highest layer; initially it hides a ceiling."""
+        """Set the slider's range from the lowest to the highest layer; initially it hides a ceiling."""
         cells, size = self._found[State.OCCUPIED], self._map.voxel_size
         if not len(cells):
             return
@@ -164,7 +164,7 @@ class Cells:
         layers = drawn.cells[:, 2]
         low, high = (round(float(layer + 1) * size, 6) for layer in (layers.min(), layers.max()))
         first = high if drawn.cut is None else round(drawn.cut, 6)
-        self.below.max = max(high, low + size)  # before the lowest: a slider refuses ends that cross
+        self.below.max = max(high, low + size)  # before the minimum: a slider refuses crossed ends
         self.below.min = low
         if not self._touched:
             self._fitting = True
@@ -190,7 +190,7 @@ class Cells:
         self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
 
     def _shades(self, cells: NDArray[np.int32]) -> NDArray[np.float32]:
-        """Return the brightness (N,) of the map's occupied cells, found once: what is cut off still gives shade."""
+        """Return the brightness (N,) of the map's occupied cells, computed once: hidden cells still cast shade."""
         shaded, shades = self._shaded
         if shaded is not cells:
             shades = brightness(cells)
@@ -198,7 +198,7 @@ class Cells:
         return shades
 
     def _show_dots(self, state: State) -> None:
-        found = self._found  # read before the map, which `take` sets first: no dots of an older map are kept
+        found = self._found  # read before the map, which `update` sets first: no dots of an older map are kept
         if state not in found:
             find = unknown_shell if state is State.UNKNOWN else lambda one: one.cells_in(state)
             found[state] = find(self._map)
@@ -243,7 +243,7 @@ def add_cubes(
 
 
 def linear(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return sRGB colours (N, 3) as shares of light: the page takes those of batched meshes so, and bleaches others."""
+    """Return sRGB colours (N, 3) as shares of light: the page expects these for batched meshes, and bleaches others."""
     return np.rint(255 * (colours / 255) ** GAMMA).astype(np.uint8)
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Level of detail: cells of one kind in the viewer, full size near a viewpoint and coarser far away.
 
-A browser draws some hundred thousand cubes smoothly, and a map may hold millions of cells. They are split into chunks;
-each is sent with cells of 1, 2, 4 ... times the side, as coarse as is hardly visible, and coarser where there are still
-too many. Only changes are sent.
+A browser draws several hundred thousand cubes smoothly, and a map may have millions of cells. They are split into
+chunks; each is sent with cells of 1, 2, 4 ... times the side, as coarse as is barely visible, and coarser if there are
+still too many. Only changes are sent.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ANGLE = 0.002
 """A cell that appears smaller than this angle in radians, about two pixels, may be drawn coarser."""
 WIDER = 1.25
 HALF = 1 << 20
-"""Indices of cells lie between -HALF and HALF."""
+"""Indices of cells are between -HALF and HALF."""
 Key = tuple[int, int, int]
 
 
@@ -51,15 +51,15 @@ class Chunk:
         self.node: SceneNodeHandle | None = None
 
     def is_like(self, other: Chunk) -> bool:
-        """Return whether both look the same."""
+        """Return whether both are equal."""
         return np.array_equal(self.cells, other.cells) and np.array_equal(self.colours, other.colours)
 
 
 class Chunks:
-    """All cells of one kind. name: of the node in the scene, below which each chunk has one of its own.
+    """All cells of one kind. name: of the scene node, below which each chunk has its own.
 
-    size: side of a cell in metres. most: cells that are sent at once, about. chunks: by place, in chunks from the
-    origin on.
+    size: side of a cell in metres. most: approximate number of cells sent at once. chunks: by place, in chunks from the
+    origin.
     """
 
     def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, max_cells: int = MAX_CELLS):
@@ -86,7 +86,7 @@ class Chunks:
         self.look_from(eyes)
 
     def look_from(self, eyes: NDArray[np.floating]) -> None:
-        """Send what viewpoints at `eyes` (n, 3) need in addition."""
+        """Send what viewpoints at `eyes` (n, 3) additionally need."""
         keys = list(self.chunks)
         numbers = np.array([len(self.chunks[key].cells) for key in keys])
         found = levels(np.array(keys), numbers, eyes, self._size, self._max_cells)
@@ -146,8 +146,8 @@ def levels(
 ) -> NDArray[np.int64]:
     """Return the number of doublings (n,) of cells in chunks at `places` (n, 3) with `numbers` (n,) cells.
 
-    eyes: (m, 3) in metres; each chunk is as fine as the nearest needs. Cells of surfaces become a quarter with each
-    doubling, about; the least coarse levels are taken that leave `max_cells`.
+    eyes: (m, 3) in metres; each chunk is as fine as the nearest needs. Each doubling leaves about a quarter of a
+    surface's cells; the finest levels within `max_cells` are chosen.
     """
     if not len(places):
         return np.zeros(0, np.int64)

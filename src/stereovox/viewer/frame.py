@@ -39,7 +39,7 @@ REASON_COLOURS = {
 SHARED = "near red, far blue"
 MAX_WIDTH_PX = 480
 CLOUD_ROWS, HIGHEST_DEG, DEG_PER_ROW = 90, 45.0, 1.0
-"""Picture of a cloud: its rows, the elevation of the first, and from one to the next."""
+"""Picture of a cloud: number of rows, elevation of the first, and degrees per row."""
 EMPTY = np.full((180, 240, 3), 128, np.uint8)
 
 
@@ -57,7 +57,7 @@ def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
 
 
 def cloud_picture(cloud: CheckedCloud, max_range: float) -> NDArray[np.uint8]:
-    """Return a cloud as RGB (rows, columns, 3), all round: the nearest range in each direction, ahead in the middle."""
+    """Return a cloud as all-round RGB (rows, columns, 3): the nearest range in each direction, ahead in the middle."""
     points = cloud.ends[cloud.hits]
     ranges = np.linalg.norm(points, axis=1)
     left = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
@@ -79,7 +79,7 @@ def reasons_key() -> str:
 
 
 class FramePanel:
-    """The depth image as the map uses it. image, text: the elements of the page."""
+    """The depth image as used for the map. image, text: the elements of the page."""
 
     def __init__(self, server: ViserServer, config: Config):
         self._config, self._path = config, DepthPipeline(config)
@@ -88,7 +88,7 @@ class FramePanel:
         self.text = server.gui.add_markdown("")
 
     def show(self, frame: AnyFrame, text: str) -> None:
-        """Show the depth image or the cloud of a frame, which may be a refused one, with `text` below."""
+        """Show the depth image or the cloud of a frame, even a refused one, with `text` below."""
         try:
             self.image.image = self._picture(frame)
         except FrameRefused:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SHARP_PX = 1024
 """Browsers blur enlarged images: a layer's longer side is sent with at least about half this many pixels."""
 MAX_PX = 4096
-"""Largest side of an image that every browser can draw; longer layers are thinned."""
+"""Largest image side that every browser can draw; longer layers are thinned."""
 
 
 class LayerPlane:
@@ -28,7 +28,7 @@ class LayerPlane:
 
     node: the scene's image, None before it is first shown. show: check box. across: drop-down of the axis that the
     plane is perpendicular to. at: for each axis a slider in metres, of which one is visible. scale, colours: the
-    numbers that it shows, and the mappable for their colour bar.
+    displayed numbers, and the mappable for their colour bar.
     """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
@@ -47,7 +47,7 @@ class LayerPlane:
             control.on_update(lambda _: self.draw())
 
     def update(self, voxel_map: VoxelMap) -> None:
-        """Show another map with cells of the same size, which must not change from now on."""
+        """Show another map with cells of the same size, which must no longer change."""
         self._map, bounds = voxel_map, voxel_map.bounds()
         if bounds is not None:
             for axis, slider in enumerate(self.at.values()):
@@ -57,7 +57,7 @@ class LayerPlane:
         self.draw()
 
     def _draw(self) -> None:
-        """Move the plane to where the controls say."""
+        """Move the plane according to the controls."""
         across = self.across.value
         for name, slider in self.at.items():
             slider.visible = name == across
@@ -69,7 +69,7 @@ class LayerPlane:
             self.node.visible = False
 
     def _fit(self, slider: Any, bounds: NDArray[np.float64]) -> None:
-        """Let a slider reach from the centre of the lowest layer to that of the highest, one step per layer."""
+        """Set a slider's range from the centre of the lowest layer to the highest one's, one step per layer."""
         size = self._map.voxel_size
         low, high = (round(float(face), 6) for face in (bounds[0] + size / 2, bounds[1] - size / 2))
         slider.max = max(high, low + size)
@@ -84,7 +84,7 @@ class LayerPlane:
 
 
 def layer_colours(scale: Scale) -> Any:
-    """Return matplotlib's colours of the numbers that a scale shows; unknown cells are transparent."""
+    """Return matplotlib's colours of a scale's numbers; unknown cells are transparent."""
     from matplotlib.cm import ScalarMappable
 
     colours, norm = scale.colours()

@@ -21,7 +21,7 @@ from stereovox.viewer.serve import HERE, PORT
 from stereovox.viewer.viewer import open_viewer
 
 HEALTH_S = 0.5
-"""Seconds between two updates of the map's health, also while no frame comes."""
+"""Seconds between two updates of the map's health, also while no frame arrives."""
 MIN_S = 0.5
 """Minimum seconds between two updates."""
 COPY_REST, DRAW_REST = 25, 4
@@ -33,8 +33,8 @@ class LiveView:
     """Page that shows the map of a `Mapper` while it grows. Pass each frame to `add` instead of the mapper's.
 
     It is also an `Observer` for `map_recording`. Between two frames the map is copied, and the page is drawn from the
-    copy in a thread of its own: nothing reads the map while a kernel writes it. The page shows the health of the map,
-    also while no frame comes.
+    copy in its own thread: nothing reads the map while a kernel writes it. The page shows the map's health, also while
+    no frame arrives.
 
     Args:
         mapper: The mapper whose map is shown.
@@ -156,7 +156,7 @@ class LiveView:
         self.viewer.follow()
 
     def _show_health(self) -> None:
-        """Say how old the map is, in bold where it is too old to be acted on."""
+        """Show the map's age, in bold if it is too old to act on."""
         health = self._mapper.health()
         text = plain(health.text)
         self.health.content = f"**{text}**" if health.state in STALE else text

@@ -53,7 +53,7 @@ class Measure:
 
     def _draw(self) -> None:
         scene, points = self._server.scene, self.picked
-        root = scene.add_frame("/measure", show_axes=False)  # what was below it goes
+        root = scene.add_frame("/measure", show_axes=False)  # removes its children
         for n, point in enumerate(points):
             scene.add_icosphere(f"{root.name}/{n}", self._size / 2, tuple(rgb(COLOUR).tolist()), position=point)
         self.text.content = FIRST if points else HOW
@@ -69,13 +69,13 @@ def format_distance(points: list[NDArray[np.floating]]) -> str:
     """Format the distance of two points (3,) in metres as Markdown."""
     step = points[1] - points[0]
     along = ", ".join(f"{name} {value:+.2f}" for name, value in zip("xyz", step, strict=True))
-    return f"**{np.linalg.norm(step):.2f} m** from middle to middle ({along})"
+    return f"**{np.linalg.norm(step):.2f} m** from centre to centre ({along})"
 
 
 def first_hit(
     cells: NDArray[np.int32], size: float, origin: ArrayLike, direction: ArrayLike
 ) -> NDArray[np.int32] | None:
-    """Return the first of the cells (N, 3) with sides of `size` metres that a ray hits, (3,); None: none.
+    """Return the first of the cells (N, 3) with sides of `size` metres that a ray hits, (3,); None if it hits none.
 
     origin, direction: (3,) in metres, world frame.
     """

@@ -41,7 +41,7 @@ def statistics(voxel_map: VoxelMap) -> str:
 def plain(text: str) -> str:
     """Escape text so that Markdown shows it literally.
 
-    The page would execute `{...}` and `<...>`, and a map may come from someone else.
+    The page would execute `{...}` and `<...>`, and a map may be from someone else.
     """
     text = " ".join(text.encode("utf-8", "replace").decode().split())
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
@@ -66,12 +66,12 @@ def colour_bar(scale: Any, label: str, limits: tuple[float, float] | None = None
 def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
     """Return a picture (H, W, 3) of the log-odds along the optical axis (Chien 2020, Fig 4.6).
 
-    Raises StereovoxError if the map does not know its camera.
+    Raises StereovoxError if the map has no camera.
     """
     figure = _figure(2.9)
     axis = figure.add_subplot()
     draw_profile(axis, voxel_map)
-    axis.set_title("", loc="left")  # what a page has room for, a panel has not
+    axis.set_title("", loc="left")  # a panel has no room for it
     axis.set_xlabel("distance from the camera [m]")
     if axis.get_legend() is not None:
         axis.get_legend().remove()

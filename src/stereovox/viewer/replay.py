@@ -30,7 +30,7 @@ NOTICE_S = 0.5
 class Replay:
     """Maps a recording again up to the frame chosen on the timeline.
 
-    at: slider with the number of the last frame that is in the map, from 1 on. play: check box.
+    at: slider with the number of the last frame in the map, from 1. play: check box.
     """
 
     def __init__(self, viewer: Viewer, source: Source, config: Config):
@@ -50,7 +50,7 @@ class Replay:
         self.frame.show(source.frame(len(source) - 1), "the last frame; move the timeline or tick play")
 
     def _draw(self) -> None:
-        """Show the map as of the frame that the slider is at now."""
+        """Show the map as of the slider's frame."""
         number = int(self.at.value)
         self._go_to(number)
         frame = self._source.frame(number - 1)
@@ -58,7 +58,7 @@ class Replay:
         self._viewer.update(in_cubes(self._mapper.map.snapshot()))
 
     def _go_to(self, number: int) -> None:
-        before = self._nearest(number - 1)  # the frame itself is added last: the page tells what it did
+        before = self._nearest(number - 1)  # the frame itself is added last: the page shows its effect
         if number < self._done or before > self._done:
             self._start_from(before)
         due = monotonic() + NOTICE_S
@@ -78,7 +78,7 @@ class Replay:
         self._mapper, self._done, self._report = Mapper(self._config, resume=earlier), number, None
 
     def _keep(self) -> None:
-        """Keep a copy from time to time, as memory allows."""
+        """Keep occasional copies, as memory allows."""
         room = MAX_KEPT_BYTES // max(self._mapper.map.memory_bytes, 1)
         apart = max(1, len(self._source) // max(1, min(KEPT, room)))
         if self._done % apart == 0 and self._done not in self._kept:
@@ -89,7 +89,7 @@ class Replay:
             threading.Thread(target=self._play, daemon=True).start()
 
     def _play(self) -> None:
-        """Move the timeline in real time, skipping frames that cannot be drawn in time."""
+        """Move the timeline in real time, skipping frames that would be late."""
         seconds = self._seconds_a_frame()
         if self.at.value >= len(self._source):
             self.at.value = 1

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 HERE, PORT = "127.0.0.1", 8080
 TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
-"""A token that fits into a link and a cookie without escaping and cannot be guessed."""
+"""A token that needs no escaping in a link or a cookie and cannot be guessed."""
 PATIENCE_S = 5.0
 """Seconds within which a browser must send its request."""
 ANSWER_S = 60.0
@@ -57,9 +57,9 @@ def is_loopback(number: str) -> bool:
 
 
 def find_address(host: str, port: int) -> Address:
-    """Return the address to listen on: the first one of `host`, resolved only once, since the answer may change.
+    """Return the address to listen on: the first one of `host`, resolved only once, because the answer may change.
 
-    Raises StereovoxError if no page can be served there; viser would use another port or wait for ever.
+    Raises StereovoxError if no page can be served there; viser would use another port or wait forever.
     """
     if not 0 <= port <= 65535:
         raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535")
@@ -115,8 +115,8 @@ def checked_token(token: str) -> str:
 class Guard:
     """Access control: admits requests with the token or, without one, from this machine.
 
-    host: the name or address that is served. A browser is admitted only if the requesting page came from this server:
-    else any page on the web could read the map through that browser, or through a name of its own that resolves to this
+    host: the name or address that is served. A browser is admitted only if the requesting page is from this server:
+    else any page on the web could read the map through that browser, or through its own name that resolves to this
     machine (DNS rebinding).
     """
 
@@ -129,7 +129,7 @@ class Guard:
         if len(named) != 1:
             return "one Host header is needed"
         if any(_place(origin) != named[0].lower() for origin in origins):
-            return "the page that asks came from elsewhere"
+            return "the requesting page is from elsewhere"
         if self._token is None:
             return None if self._is_here(named[0]) else "this machine has no such name"
         offered = [*_in_link(path), *_in_cookies(headers.get_all("Cookie"), _cookie_name(port))]
@@ -138,7 +138,7 @@ class Guard:
         return "open the link that stereovox printed: it holds the token"
 
     def cookie(self, path: str, port: int) -> str | None:
-        """Return the cookie header that admits a browser from now on, for requests whose link holds the token.
+        """Return the cookie header that admits a browser from now on, for requests whose link has the token.
 
         It is hidden from scripts and other sites.
         """
@@ -157,7 +157,7 @@ class Guard:
 
 
 def _place(origin: str) -> str:
-    """Return name and port of an origin; nothing for what is none."""
+    """Return name and port of an origin; empty if invalid."""
     try:
         return urlsplit(origin).netloc.lower()
     except ValueError:
@@ -165,7 +165,7 @@ def _place(origin: str) -> str:
 
 
 def _name(host: str) -> str:
-    """Return the name in a Host header, without its port; nothing for what is none."""
+    """Return the name in a Host header, without its port; empty if invalid."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:
@@ -195,13 +195,13 @@ def serve(name: str, address: Address, guard: Guard) -> ViserServer:
     """Start a server whose every page, file and websocket is behind `guard`.
 
     Raises MissingExtra without viser, StereovoxError if the port has been taken meanwhile or this version of viser
-    does not ask the guard.
+    bypasses the guard.
     """
     try:
         import viser
     except ImportError:
         raise MissingExtra("viser", "viewer") from None
-    with redirect_stdout(io.StringIO()), _guarded(guard):  # viser introduces itself there
+    with redirect_stdout(io.StringIO()), _guarded(guard):  # viser prints a greeting
         server = viser.ViserServer(host=address.number, port=address.port, label=name, verbose=False)
     port = server.get_port()
     if address.port and port != address.port:
@@ -215,7 +215,7 @@ def serve(name: str, address: Address, guard: Guard) -> ViserServer:
 
 def stop(server: ViserServer) -> None:
     """Stop the server."""
-    with redirect_stdout(io.StringIO()):  # viser says goodbye there
+    with redirect_stdout(io.StringIO()):  # viser prints a farewell
         server.stop()
 
 
@@ -244,7 +244,7 @@ def _asking(guard: Guard, answer: Callable[..., Any] | None) -> Callable[..., An
             return connection.respond(HTTPStatus.FORBIDDEN, f"stereovox: {refusal}\n")
         response = None if answer is None else answer(connection, request)
         if response is not None:
-            response.headers["Referrer-Policy"] = "no-referrer"  # the link holds the token
+            response.headers["Referrer-Policy"] = "no-referrer"  # the link has the token
             if (cookie := guard.cookie(request.path, port)) is not None:
                 response.headers["Set-Cookie"] = cookie
         return response
@@ -253,7 +253,7 @@ def _asking(guard: Guard, answer: Callable[..., Any] | None) -> Callable[..., An
 
 
 def _is_guarded(number: str, port: int) -> bool:
-    """Return whether a request as a stranger, which a guard never admits, is refused."""
+    """Return whether a stranger's request, which a guard never admits, is refused."""
     here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(number, number)
     connection = HTTPConnection(here, port, timeout=ANSWER_S)
     try:

@@ -31,7 +31,7 @@ user moved it by more than the last share."""
 
 AMBIENT = 1.1
 LIGHTS = ((-0.35, -0.6, 1.0, 2.2), (0.8, 0.35, 0.25, 0.7))
-"""Right, away and up of the directions that light comes from, and how much."""
+"""Right, away and up components of the lights' directions, and their intensity."""
 PEEK = """<style>
 @media (max-width: 36em) {
   div[style*="position: fixed"][style*="width: 20em"] { width: 100% !important; max-height: 11em !important; }
@@ -39,13 +39,13 @@ PEEK = """<style>
   div[style*="position: fixed"] div[style*="width: 20em"] { width: 100% !important; }
 }
 </style>"""
-"""On a phone the controls show little more than the colour bar until they are touched: they lie over the map."""
+"""On a phone, where the controls cover the map, they show little more than the colour bar until touched."""
 
 
 WIDE_ENOUGH = 0.8
 """Width over height of a page that shows a whole map from the usual distance."""
 BEFORE = (3.0, 3.0, 3.0)
-"""Where the camera of a page stands before it learns of the initial viewpoint."""
+"""Camera position of a page before it receives the initial viewpoint."""
 NARROW_PX = 480
 """Narrower maps have no room for the controls next to them."""
 
@@ -92,7 +92,7 @@ class Viewer:
         """Show another map with the same settings.
 
         Args:
-            voxel_map: The map, which must not change from now on: pass a copy of a growing one.
+            voxel_map: The map, which must no longer change: pass a copy of a growing one.
         """
         self._map = voxel_map
         for part in (self.cells, self.layer, self.cameras):
@@ -128,7 +128,7 @@ class Viewer:
             camera.position, camera.look_at = as_tuple(self._stand(camera.aspect)), as_tuple(look_at)
 
     def _stand(self, aspect: float) -> NDArray[np.float64]:
-        """Return the viewpoint (3,) in metres for a page of this width over height: high ones stand farther off."""
+        """Return the viewpoint (3,) in metres for a page of this width over height: narrow ones are farther off."""
         return self._middle + (self._eye - self._middle) * max(1.0, WIDE_ENOUGH / max(aspect, 0.1))
 
     def _welcome(self, client: ClientHandle) -> None:
@@ -149,7 +149,7 @@ class Viewer:
 
 
 class _Legend:
-    """Colour bars for what is in the scene."""
+    """Colour bars for the scene."""
 
     def __init__(self, server: ViserServer):
         blank = np.full((1, 1, 3), 255, np.uint8)
@@ -158,7 +158,7 @@ class _Legend:
         self._explained: Any = None
 
     def explain(self, cells: Cells, plane: LayerPlane) -> None:
-        """Update the colour bars of the cells, and of the layer where it is shown."""
+        """Update the colour bars of the cells, and of the layer if it is shown."""
         limits = None if cells.scale is None else (cells.scale.norm.vmin, cells.scale.norm.vmax)
         self._slice.visible = plane.show.value
         if self._explained is None:
@@ -196,7 +196,7 @@ def open_viewer(
 
     Raises:
         MissingExtra: viser is not installed.
-        StereovoxError: Invalid `up`, `token` or `most_cells`, or the address cannot be used.
+        StereovoxError: Invalid `up`, `token` or `most_cells`, or an unusable address.
     """
     if most_cells < 1:
         raise StereovoxError(f"{most_cells} cells at once: give a number above 0, 250000 for most browsers")
@@ -209,7 +209,7 @@ def open_viewer(
 
 def _dress(server: Any) -> None:
     server.request_share_url = lambda *_, **__: None  # else any page in the browser could ask it to publish the map
-    server.scene.configure_environment_map(hdri=None)  # its reflections make all heights look alike
+    server.scene.configure_environment_map(hdri=None)  # its reflections hide height colours
     server.gui.main_panel.dock_right()  # next to the map, not over it
     server.gui.add_html(PEEK)
     _theme(server, False)

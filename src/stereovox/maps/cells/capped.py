@@ -35,7 +35,7 @@ class CappedStorage(Storage):
             rows, bare = self._pool.needed_by(cells)
             if max(rows, bare) > self._most or (self._times is not None and len(self._pool) + len(coords) > self._most):
                 raise ConfigError(
-                    f"cannot go on: the map needs more memory than max_memory {self._allowed}; "
+                    f"cannot continue: the map needs more memory than max_memory {self._allowed}; "
                     'allow more, or set when_full to "spill"'
                 )
             self.insert(coords, cells)

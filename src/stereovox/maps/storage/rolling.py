@@ -87,7 +87,9 @@ class RollingStorage(Storage):
             try:
                 self._window.restore(earlier.window_state)
             except (KeyError, TypeError, ValueError, OverflowError) as error:
-                raise ConfigError(f"cannot go on: the map's window is damaged ({error}); make the map anew") from None
+                raise ConfigError(
+                    f"cannot continue: the map's window is damaged ({error}); make the map again"
+                ) from None
             self.window_state = earlier.window_state
             self._take_over()
             self._rehearse()

@@ -119,7 +119,7 @@ class Storage(Guarded):
     @staticmethod
     def _check_same(name: str, old: Any, new: Any) -> None:
         if old != new:
-            raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+            raise ConfigError(f"cannot continue: the map was made with {name} {old}, the new setting is {new}")
 
     def continue_with(self, config: Config) -> None:
         """Adopt the settings of a run that continues this map; raises ConfigError as `check_cells` does."""

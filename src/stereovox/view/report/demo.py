@@ -32,7 +32,7 @@ LABELS = {
 def write_report(path: str | Path, summary: dict[str, Any], picture: str | Path) -> None:
     """Write the page of a demo run: `summary` as `lab.demo.demo` returns it, `picture` a PNG file to embed.
 
-    Raises StereovoxError when the file cannot be written.
+    Raises StereovoxError if the file cannot be written.
     """
     text = report(summary, Path(picture).read_bytes())
     with replacing(path, StereovoxError) as file:

@@ -104,7 +104,7 @@ def write_evaluation_report(
 ) -> Path:
     """Write `evaluation.html` into `folder`, created if missing, and return its path.
 
-    truth: name of what the maps were compared with. Raises StereovoxError for no result at all and where the page
+    truth: name of the reference. Raises StereovoxError without any result and if the page
     cannot be written.
     """
     return page.write_page(folder, "evaluation.html", evaluation_page(results, truth, heading))

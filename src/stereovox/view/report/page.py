@@ -37,7 +37,7 @@ def write_page(folder: str | Path, name: str, text: str) -> Path:
 def write_files(folder: str | Path, contents: dict[str, bytes]) -> Path:
     """Write files into `folder`, created if missing, each atomically; return the path of the first.
 
-    Raises StereovoxError, one line, where one cannot be written.
+    Raises StereovoxError, one line, if one cannot be written.
     """
     check_local(folder)
     try:

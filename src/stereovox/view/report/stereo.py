@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of a stereo calibration: the corners, how well they fit, and a rectified pair."""
+"""Report of a stereo calibration: the corners, their errors, and a rectified pair."""
 
 from __future__ import annotations
 

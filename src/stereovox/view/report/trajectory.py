@@ -12,7 +12,7 @@ from stereovox.view.report import page
 from stereovox.view.trajectory import trajectory_png
 
 OFFSET_DEG = 5.0
-"""A rotation that all poses are off by is noted above this."""
+"""A common rotation error of all poses is noted above this."""
 OTHER_AXES = "the two do not follow the same axes of the body (then the errors of motions are wrong, too)"
 STRAIGHT = "the trajectory is too straight for positions to align the roll about it"
 NOT_ALIGNED = "they are not in one frame (then leave --no-align out)"
@@ -50,7 +50,7 @@ def write_trajectory_report(
 
 
 def paired(score: TrajectoryScore) -> str:
-    """Return how many poses have a partner, and what they cover, in words."""
+    """Return the number of paired poses and their coverage, in words."""
     pairs = score.pairs
     lasting = "" if score.duration_s is None else f" in {score.duration_s:.2f} s"
     return (
@@ -60,14 +60,14 @@ def paired(score: TrajectoryScore) -> str:
 
 
 def aligned(score: TrajectoryScore) -> str:
-    """Return what was done to the estimate first, in words."""
+    """Return the alignment of the estimate, in words."""
     if not score.aligned:
         return "Compared as they stand, in one frame."
     return "Aligned rigidly first." if score.scale == 1 else f"Aligned first, with the scale {score.scale:.6g}."
 
 
 def notes(score: TrajectoryScore) -> list[str]:
-    """Return what a reader of the figures should know, in words."""
+    """Return notes for readers of the figures."""
     found = []
     if score.rotation_offset_deg > OFFSET_DEG:
         why = STRAIGHT if score.aligned else NOT_ALIGNED

@@ -45,7 +45,7 @@ FOOTINGS = {
 
 
 def page_of(shape: tuple[int, int], panels: int = 1) -> tuple[Any, list[Any]]:
-    """Return a figure that fits panels of so many rows and columns, side by side, and these."""
+    """Return a figure for panels of this shape (rows, columns), side by side, and the panels."""
     rows, columns = shape
     figure = figure_of(float(np.clip(0.9 * WIDTH / panels * rows / columns, 3, 13)) + 2.0)
     return figure, list(figure.subplots(1, panels, squeeze=False)[0])
@@ -75,7 +75,7 @@ def show(axis: Any, floor: Floor, image: NDArray, **how: Any) -> Any:
 
 
 def mark(axis: Any, floor: Floor, points: ArrayLike, colour: str) -> None:
-    """Draw the columns that hold points (N, 3) in metres in one colour."""
+    """Draw the columns that contain points (N, 3), in metres, in one colour."""
     from matplotlib.colors import to_rgba
 
     image = np.zeros((*floor.shape, 4))

@@ -45,7 +45,7 @@ def draw_axis(
 def draw_profile(
     axis: Any, voxel_map: VoxelMap, length_m: float | None = None, viewpoint: Viewpoint | None = None
 ) -> tuple[float, float] | None:
-    """Draw one step per cell in its state's colour, with the thresholds; in bytes where the map has them.
+    """Draw one step per cell in its state's colour, with the thresholds; in bytes if the map has them.
 
     Returns the start and end of the first occupied cells in metres, None if missing.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dark pictures: a finished figure with its page, letters and flat colours exchanged; no drawing knows of themes."""
+"""Dark pictures: a finished figure with its page, letters and flat colours replaced; drawing code has no themes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereovox.view.panels import GREY, INK, LINE, STATE_COLOURS
 
 PAGE = "#12161d"
 MAX_STATES = 16
-"""Colour maps of more colours are scales, which stay."""
+"""Colour maps with more colours are scales, which are kept."""
 COLOURS = {
     "#ffffff": PAGE,
     "#000000": "#eef1f6",
@@ -25,12 +25,12 @@ COLOURS = {
     "#f3f4f6": "#1a2029",
     "#dfe2e7": "#2b3340",
 }
-"""Colours of light pages, and what they become; all others stay."""
+"""Colours of light pages, and their replacements; all others are kept."""
 
 
 def darken(figure: Any) -> None:
     """Turn a finished figure of this package into one on a dark page."""
-    figure.draw_without_rendering()  # ticks and their labels are there from now on
+    figure.draw_without_rendering()  # creates ticks and their labels
     for artist in figure.findobj():
         for name in ("color", "facecolor", "edgecolor", "markeredgecolor", "markerfacecolor"):
             _exchange(artist, name)
@@ -51,7 +51,7 @@ def _exchange(artist: Any, name: str) -> None:
 
 
 def _dark(colour: Any) -> Any:
-    """Return the colour that stands for one on a dark page, as opaque as before."""
+    """Return a colour's replacement on a dark page, with the same opacity."""
     from matplotlib.colors import is_color_like, to_hex, to_rgba
 
     if not is_color_like(colour):  # "none" of a line's marker, for example
@@ -61,7 +61,7 @@ def _dark(colour: Any) -> Any:
 
 
 def _exchange_map(image: Any) -> None:
-    """Exchange the flat colours of states; those of heights and log-odds stay."""
+    """Replace the flat colours of states; colours of heights and log-odds are kept."""
     from matplotlib.colors import ListedColormap
 
     colours = image.get_cmap()

@@ -17,7 +17,7 @@ from stereovox.maps.upright import turned as turned
 from stereovox.view.scene.shading import Occlusion
 
 BESIDE = 0.1
-"""A camera's path is drawn up to this share of the map's longest side next to its known cells."""
+"""A camera's path is drawn up to this share of the map's longest side beyond its known cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Drawn:
 
     @cached_property
     def occlusion(self) -> Occlusion:
-        """What stands before the faces of the cells `below_ceiling`."""
+        """Occlusion of the faces of the cells `below_ceiling`."""
         return Occlusion(self.below_ceiling)
 
     @cached_property
@@ -68,9 +68,9 @@ class Drawn:
 
 
 def camera_path(voxel_map: VoxelMap) -> NDArray[np.float64]:
-    """Return the path (N, 3) in metres of the cameras that made a map, as it is drawn: NaN where the line breaks.
+    """Return the path (N, 3) in metres of a map's cameras for drawing: NaN at breaks.
 
-    It breaks between two cameras, and where the path leaves the map: a map may be a part of what its cameras saw.
+    It breaks between two cameras, and outside the map: a map may cover only a part of its cameras' view.
     """
     lines, bounds = voxel_map.history.path.lines(), voxel_map.bounds()
     if not lines or bounds is None:

@@ -26,7 +26,7 @@ FROM = Direction.of(-115, 40)
 
 
 def draw_landscape(axis: Any, one: Layer, voxel_map: VoxelMap) -> None:
-    """Draw one column per cell, as high as its log-odds (bytes where the map has them); unknown cells are grey."""
+    """Draw one column per cell, as high as its log-odds (bytes if the map has them); unknown cells are grey."""
     from matplotlib.colors import to_rgb
 
     scale = scale_of(voxel_map)
@@ -71,7 +71,7 @@ def columns(heights: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _levels(values: NDArray[np.float64], scale: Scale, levels: int) -> NDArray[np.int64]:
-    """Return heights (rows, columns) from 1 to `levels`, unknown at its place between."""
+    """Return heights (rows, columns) from 1 to `levels`, unknown at its place between them."""
     share = (np.nan_to_num(values, nan=scale.unknown) - scale.lowest) / (scale.highest - scale.lowest)
     return np.clip(np.rint(1 + share * (levels - 1)), 1, levels).astype(np.int64)
 

@@ -34,7 +34,7 @@ def draw_layer(
 ) -> Any:
     """Return a figure of one layer: states, log-odds as colours, log-odds as a landscape, and along the optical axis.
 
-    at_m: height in metres along `up`; by default the camera's, or that of the most informative layer without one.
+    at_m: height in metres along `up`; by default the camera's, or without one the most informative layer's.
     viewpoint: by default the map's last. counted: as for `draw_view`.
     Raises StereovoxError for an empty map or an invalid `up`.
     """
@@ -58,7 +58,7 @@ def draw_layer(
 
 
 def upright_layer(voxel_map: VoxelMap, up: str, at_m: float) -> Layer:
-    """Return the layer at height `at_m` along `up`, seen from above: never mirrored; `across` is `up` as given."""
+    """Return the layer at height `at_m` along `up`, seen from above, never mirrored; `across` is `up` as given."""
     sign = -1.0 if up.startswith("-") else 1.0
     one = layer(voxel_map, up[-1], sign * at_m)
     names = ("xyz"[UPS[up][0]], "xyz"[UPS[up][1]])
@@ -121,7 +121,7 @@ def _where(one: Layer) -> str:
 
 
 def _squares(axis: Any, one: Layer) -> None:
-    """Outline the cells where they are large enough to be distinguished."""
+    """Outline the cells if they are large enough to be distinguished."""
     rows, columns = one.state.shape
     if max(rows, columns) > MAX_SQUARES:
         return
@@ -148,7 +148,7 @@ def _camera(axis: Any, one: Layer, viewpoint: Viewpoint) -> None:
 
 
 def _stretched(start: NDArray[np.float64], end: NDArray[np.float64], one: Layer) -> NDArray[np.float64]:
-    """Return a point on the ray from `start` through `end` that lies beyond the layer."""
+    """Return a point on the ray from `start` through `end`, beyond the layer."""
     reach = float(np.hypot(one.extent[1] - one.extent[0], one.extent[3] - one.extent[2]))
     length = float(np.linalg.norm(end - start))
     return end if length < 1e-6 else start + (end - start) * min(reach / length, 1e4)

@@ -79,11 +79,11 @@ def _painted(
     width: int,
     front: NDArray[np.int32],
 ) -> NDArray[np.int32]:
-    """Return `front` (pixels,) with 1 + 3 * cell + face where the last cell in order covers a pixel."""
+    """Return `front` (pixels,) with 1 + 3 * cell + face of the last cell in order that covers each pixel."""
     number = 1 + 3 * np.arange(len(middle), dtype=np.int32)
     for dx, dy, side in zip(across.tolist(), down.tolist(), face.tolist(), strict=True):
         place = (middle + (dy * width + dx)).clip(0, len(front) - 1)
-        front[place] = np.maximum(front[place], number + side)  # of equal places the last, the nearest, stays
+        front[place] = np.maximum(front[place], number + side)  # of equal places the last, the nearest, wins
     return front
 
 

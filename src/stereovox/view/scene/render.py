@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Render cells as shaded cubes: orthographic, with hidden surfaces removed, in NumPy alone.
 
-All cells are equal and the projection is parallel, so every visible face of one direction covers the same pattern of
-pixels; a face is drawn by writing its cell's rank from far to near wherever the pattern falls and nothing nearer is.
+All cells are equal and the projection is parallel, so all visible faces of one direction have the same pixel pattern;
+a face is drawn by writing its cell's rank over the pattern from far to near.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Direction:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An RGBA image (height, width, 4) float32 and what it covers: left, right, bottom, top in picture metres.
+    """An RGBA image (height, width, 4) float32 and its extent: left, right, bottom, top in picture metres.
 
-    near: (rows, columns) float32, how far towards the viewer the centre of the cell in each pixel is, in metres; -inf
+    near: (rows, columns) float32, distance towards the viewer of each pixel's cell centre, in metres; -inf
     if there is none. It may be finer than the image.
     """
 
@@ -56,9 +56,9 @@ class Rendering:
     near: NDArray[np.float32]
 
     def hidden(self, flat: NDArray[np.float64], toward: NDArray[np.float64], slack: float) -> NDArray[np.bool_]:
-        """Return which points lie behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
+        """Return which points are behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
 
-        NaN is behind nothing. slack: metres by which a cell's centre may be nearer before the cell counts as in front.
+        NaN is never hidden. slack: metres by which a cell's centre must be nearer to count as in front.
         """
         left, right, bottom, top = self.extent
         rows, columns = self.near.shape
@@ -81,7 +81,7 @@ def render(
     height_px: int,
     occlusion: Occlusion | None = None,
 ) -> Rendering:
-    """Draw `cells` (N, 3) in `colours` (N, 3) as large as fits an image of this size; N > 0.
+    """Draw `cells` (N, 3) in `colours` (N, 3) as large as fits in an image of this size; N > 0.
 
     occlusion: that of `cells`, for several views of the same ones.
     """
@@ -103,7 +103,7 @@ def render(
 
 
 class _Canvas:
-    """An image that keeps for each pixel the largest number written to it, -1 if none was."""
+    """An image that keeps the largest number written to each pixel, -1 if none was."""
 
     def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], scale: float):
         self.low, self.high, self.scale = low, high, scale
@@ -118,7 +118,7 @@ class _Canvas:
         voxel_size: float,
         direction: Direction,
     ) -> None:
-        """Write `numbers` (n,) wherever the faces of `cells` (n, 3) across `axis` that look at the viewer fall."""
+        """Write `numbers` (n,) to the pixels of viewer-facing faces, across `axis`, of `cells` (n, 3)."""
         if not len(cells):
             return
         height, width = self.front.shape
@@ -135,7 +135,7 @@ class _Canvas:
 
 
 def _lit(occlusion: Occlusion, direction: Direction) -> NDArray[np.float32]:
-    """Return the brightness (N, 3) of each cell's three faces that look at the viewer, 0 where one cannot be seen."""
+    """Return the brightness (N, 3) of each cell's three viewer-facing faces, 0 for hidden ones."""
     light = []
     for axis, name in enumerate(("x", "y", "top")):
         edge_on = abs(direction.toward[axis]) < 1e-6
@@ -154,7 +154,7 @@ def extent(cells: NDArray[np.integer], voxel_size: float, direction: Direction) 
 def _pattern(sides: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the pixels (n, 2), relative to its first corner's, of a parallelogram with sides (2, 2) in pixels.
 
-    It is drawn half a pixel larger all round, so that rounding leaves no seams between neighbours.
+    It is half a pixel larger on all sides, so that rounding leaves no seams between neighbours.
     """
     corners = np.array([[0, 0], sides[0], sides[1], sides[0] + sides[1]])
     low, high = np.floor(corners.min(0)).astype(int) - 1, np.ceil(corners.max(0)).astype(int) + 1
@@ -185,7 +185,7 @@ def _shade(
 
 
 def _contour(near: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-    """Return a brightness (height, width) that darkens pixels next to something nearer: it makes edges stand out."""
+    """Return a brightness (height, width) that darkens pixels next to nearer ones, so that edges stand out."""
     shadow = np.zeros_like(near)
     with np.errstate(invalid="ignore"):
         for axis in (0, 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scale of displayed log-odds, with colours: as they are, or as the bytes that a map stores."""
+"""Scale of displayed log-odds, with colours: plain, or as the bytes that a map stores."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ambient occlusion: faces of cells are darker the more cells stand before them, so corners, gaps and contacts show."""
+"""Ambient occlusion: faces are darker the more cells are in front of them, so that corners, gaps and contacts show."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ RADII = ((1, 0.15), (2, 0.3), (3, 0.4), (4, 0.6))
 """Radii in cells of the boxes before a face whose occupied share darkens it, and how strongly."""
 
 BURIED = 0.6
-"""Mean brightness of a cell without an exposed face, seen where cells are drawn coarser."""
+"""Mean brightness of a cell without an exposed face, visible if cells are drawn coarser."""
 
 
 class Occlusion:
-    """What the faces of a set of cells see of the sky.
+    """Sky visibility of the faces of a set of cells.
 
     Args:
         cells: (N, 3) indices, none twice.
-        radii: As `RADII`; with none all faces see the whole sky.
+        radii: As `RADII`; without any, all faces see the whole sky.
     """
 
     def __init__(self, cells: NDArray[np.integer], radii: Sequence[tuple[int, float]] = RADII):
@@ -32,16 +32,16 @@ class Occlusion:
         self._found: dict[tuple[int, int], NDArray[np.float32]] = {}
 
     def brightness(self, axis: int, side: int) -> NDArray[np.float32]:
-        """Return the brightness (N,) of the faces that look along `axis`, upwards for side 1 and downwards for -1.
+        """Return the brightness (N,) of the faces along `axis`, upper ones for side 1 and lower ones for -1.
 
-        1: nothing stands before the face. 0: a cell covers it.
+        1: nothing is in front of the face. 0: a cell covers it.
         """
         if (axis, side) not in self._found:
             self._found[axis, side] = self._look(axis, side)
         return self._found[axis, side]
 
     def mean(self) -> NDArray[np.float32]:
-        """Return the mean brightness (N,) of each cell's exposed faces, for whoever has one colour for a cell."""
+        """Return the mean brightness (N,) of each cell's exposed faces, for uses with one colour per cell."""
         total, number = np.zeros(len(self._keys), np.float32), np.zeros(len(self._keys), np.float32)
         for axis in range(3):
             for side in (-1, 1):
@@ -64,7 +64,7 @@ class Occlusion:
         return brightness
 
     def _count(self, around: Keys, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many cells lie in a box about each key (n,); those that differ in z only have keys in a row."""
+        """Return the number of cells in a box around each key (n,); keys are consecutive along z."""
         number = np.zeros(len(around), np.int64)
         for dx in range(low[0], high[0] + 1):
             for dy in range(low[1], high[1] + 1):
@@ -75,6 +75,6 @@ class Occlusion:
 
 
 def _shift(step: NDArray[np.integer]) -> int:
-    """Return what a step of (3,) cells adds to a key."""
+    """Return the change of a key by a step of (3,) cells."""
     cell, origin = keys(np.stack([step, np.zeros(3, np.int64)]))
     return int(cell - origin)

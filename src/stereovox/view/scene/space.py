@@ -23,7 +23,7 @@ Numbers = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
 """Direction of view: angle from straight behind the camera, and above the horizon."""
 DOTS = 300
-"""Number of points of a line that are tested for being hidden by cells."""
+"""Number of points of a line tested for being hidden by cells."""
 
 
 def numbers(label: str, low: float, high: float, least_m: float = 1e-6) -> Numbers:
@@ -70,7 +70,7 @@ def fit(axis: Any, direction: Direction, low: ArrayLike, high: ArrayLike, margin
 
 
 def _inner(edge: Numbers, low: float, high: float, room: float) -> Numbers:
-    """Return an edge without the numbers at its ends, where those of its neighbours stand."""
+    """Return an edge without the numbers at its ends, where its neighbours' numbers are."""
     label, places, values = edge
     kept = (places >= low + room) & (places <= high - room)
     return label, places[kept], values[kept]
@@ -112,7 +112,7 @@ def draw_space(
 ) -> Any:
     """Return a figure of the occupied cells, seen from behind the camera and above, with its field of view in red.
 
-    viewpoint: by default the map's last; without any the lines are left out. A ceiling is hidden.
+    viewpoint: by default the map's last; without one the lines are left out. A ceiling is hidden.
     counted: as for `draw_view`. Raises StereovoxError for a map without occupied cells or an invalid `up`.
     """
     up = checked_up(up)
@@ -134,7 +134,7 @@ def draw_space(
 
 
 def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] | None) -> float:
-    """Draw cells coloured by height and lines (N, 2, 3), both with the third axis up; return height over width."""
+    """Draw cells coloured by height, and lines (N, 2, 3), both with the third axis up; return height over width."""
     colours, mappable = height_colours(drawn)
     direction = Direction.of(_azimuth(lines), ABOVE_DEG)
     width_px = int(0.85 * WIDTH * DPI)
@@ -144,7 +144,7 @@ def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] 
     corners = np.concatenate([corners, *([] if lines is None else [lines.reshape(-1, 3)])])
     low, high = corners.min(0), corners.max(0)
     shape = fit(axis, direction, low, high)
-    least = 0.04 * float((high - low).max())  # nearer, and the numbers of a flat map would cover each other
+    least = 0.04 * float((high - low).max())  # else the numbers of a flat map would overlap
     edges = [numbers(f"{name} [m]", a, b, least) for name, a, b in zip(drawn.names, low, high, strict=True)]
     draw_frame(axis, direction, low, high, (edges[0], edges[1], edges[2]))
     for line in lines if lines is not None else ():

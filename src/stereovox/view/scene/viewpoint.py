@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Viewpoint of a picture: the camera that the map remembers, or one given by the user."""
+"""Viewpoint of a picture: the camera stored in the map, or one given by the user."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from stereovox.maps import VoxelMap
 FIELD_M = 1.0
 """Depth of a drawn field of view (Chien 2020, Fig 4.7)."""
 USUAL = PinholeCamera.from_field_of_view(848, 480, 91.2, 0.05)
-"""A D435 (Chien 2020, 2.2.1), for maps that know no camera."""
+"""A D435 (Chien 2020, 2.2.1), for maps without a camera."""
 
 
 def known_viewpoint(viewpoint: Viewpoint | None) -> Viewpoint:
     """Return `viewpoint`; raises StereovoxError if there is none."""
     if viewpoint is None:
-        raise StereovoxError("the map does not know where its camera stood; say so: --eye=X,Y,Z --toward=X,Y,Z")
+        raise StereovoxError("the map has no camera pose; give one: --eye=X,Y,Z --toward=X,Y,Z")
     return viewpoint
 
 
@@ -53,7 +53,7 @@ def viewpoint_at(
 def field_of_view(viewpoint: Viewpoint, depth_m: float = FIELD_M) -> NDArray[np.float64]:
     """Return the edges (8, 2, 3) in metres, world frame, of the pyramid that the camera sees up to `depth_m`.
 
-    First the four from the camera to the corners, then the four round the far side.
+    First the four from the camera to the corners, then the four around the far side.
     """
     camera, T = viewpoint.camera, viewpoint.T_world_camera
     u, v = np.array([-0.5, camera.width - 0.5]), np.array([-0.5, camera.height - 0.5])

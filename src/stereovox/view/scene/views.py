@@ -30,10 +30,10 @@ def draw_view(
 
     overview: from above, from three sides, and a slice. layer: one layer across `up`, at height `at_m` along it or at
     the camera's. axis: log-odds along the optical axis. space: cells and field of view in space. viewpoint: by default
-    the map's last. counted: the map itself, whose numbers the heading gives, if `voxel_map` was turned for the picture.
-    Raises StereovoxError for an unknown view, or where the view needs a camera that is not known.
+    the map's last. counted: the original map for the heading's numbers, if `voxel_map` was turned for the picture.
+    Raises StereovoxError for an unknown view, or if the view needs an unknown camera.
     """
-    counted = counted or voxel_map  # before it is made coarser
+    counted = counted or voxel_map  # before it is coarsened
     up, voxel_map = checked_up(up), voxel_map.overview()
     if view == "overview":
         return draw(voxel_map, heading=heading, up=up, counted=counted)

@@ -62,7 +62,7 @@ def _lines(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _again(row: dict[str, Any], result: dict[str, Any]) -> bool:
-    """Return whether a row is one of ours with more threads, which makes the same map."""
+    """Return whether a row is ours with more threads, which makes the same map."""
     return is_ours(row) and row["threads"] != result["rows"][0]["threads"]
 
 
@@ -129,7 +129,7 @@ def _plain(text: str) -> str:
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return all tables of a result: the comparison, and those under `more`."""
+    """Return all tables of a result: the comparison, and the ones under `more`."""
     compared = [comparison_table(found) for found in (result, result.get("clearing", {})) if found.get("rows")]
     return compared + [MEASUREMENTS[name].table(found) for name, found in result.get("more", {}).items()]
 

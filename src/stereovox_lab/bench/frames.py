@@ -32,10 +32,10 @@ class Recording:
     frames: list[Frame]
     refusals: list[str]
     far_share: float = 0.0
-    """Share of the pixels that are beyond the maximum range, and clear space up to there."""
+    """Share of the pixels beyond the maximum range, which clear space up to it."""
 
     def without_far(self, config: Config) -> Recording:
-        """Return the same frames, all that is beyond the maximum range without a value."""
+        """Return the same frames without values beyond the maximum range."""
         return Recording(self.name, [_usable_pixels(frame, config, far=False) for frame in self.frames], self.refusals)
 
     @property
@@ -50,8 +50,8 @@ def read_frames(
 ) -> Recording:
     """Read the usable frames of `source` (at most `limit`).
 
-    Pixels without a value are 0, and so are those beyond `config.max_range` unless they stay (`far`), which clear space
-    up to there; poses are exactly rigid. Raises StereovoxError when no frame can be used.
+    Pixels without a value are 0, and so are those beyond `config.max_range`, unless kept (`far`) to clear space
+    up to there; poses are exactly rigid. Raises StereovoxError if no frame is usable.
     """
     total = operator.length_hint(source)
     total = total if limit is None else min(total, limit)
@@ -83,7 +83,7 @@ def depth_for_peers(image: DepthImage, beyond_m: float) -> NDArray[np.float32]:
 def points_of(image: DepthImage, beyond_m: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the points (N, 3) in the world of all pixels with a value, and the camera's position (3,).
 
-    beyond_m: the depth of points in place of pixels beyond the maximum range; 0: these have none.
+    beyond_m: depth of the points for pixels beyond the maximum range; 0: no points.
     """
     T, depth_m = image.T_world_sensor, depth_for_peers(image, beyond_m)
     v, u = np.nonzero(depth_m)
@@ -93,7 +93,7 @@ def points_of(image: DepthImage, beyond_m: float = 0.0) -> tuple[NDArray[np.floa
 
 
 def _usable_pixels(frame: Frame, config: Config, far: bool) -> Frame:
-    """Return the frame in its own units, all that has no value (and, unless `far`, all beyond the range) set to 0."""
+    """Return the frame in its own units, with missing values (and, unless `far`, those beyond the range) set to 0."""
     image = prepare(frame, config)
     valid, beyond = image.reason == Reason.VALID, image.reason == Reason.TOO_FAR
     if not valid.any():

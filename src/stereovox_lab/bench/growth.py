@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of a frame by length of the flight and by size of the map."""
+"""Cost of a frame against flight length and map size."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from stereovox_lab.bench.rows import median
 CELLS = (10**4, 10**5, 10**6, 10**7, 10**8)
 BLOCK_CELLS = 512
 BYTES_A_CELL = 7
-"""Needed while a map grows, at most: it moves to a place half as large again, two bytes a cell, and for a moment holds
-both, next to the evidence that is added."""
+"""Most bytes needed while a map grows: it moves to an array half as large again, two bytes a cell, and for a moment
+holds both, next to the evidence to be added."""
 ROUNDS = 3
 SEED = 0
 FRAMES = 6000
@@ -36,10 +36,10 @@ MIN_FRAMES = 500
 FRAMES_A_METRE = 6
 SETTINGS = {"voxel_size": 0.2, "max_range": 5.0}
 WINDOW = {"window.size": [20.0, 20.0, 16.0]}
-"""Holds all that the camera sees up to 5 m; what leaves it is dropped."""
+"""Contains the camera's view up to 5 m; cells that leave it are dropped."""
 MAPS = {"rolling window": {**SETTINGS, **WINDOW}, "unbounded": SETTINGS}
 CHUNK = 50
-"""Frames whose median is one figure."""
+"""Frames per median."""
 
 
 def cost_by_map_size(
@@ -49,11 +49,11 @@ def cost_by_map_size(
     memory: int | None = None,
     tell: Progress = silent,
 ) -> dict[str, Any]:
-    """Time the frames where the map holds so many `cells` already, which the camera does not reach.
+    """Time frames in maps that already have this many `cells` out of the camera's reach.
 
-    The cells, of random evidence, lie in a cube about the camera's way, less those within its range: so each map does
-    the same work with a frame, among so many others. Every map sees all frames once before the clock starts, then they
-    take turns, frame by frame. memory: bytes that may be used (None: what the system has left).
+    The cells, with random evidence, form a cube around the camera's path, without those within its range: so each map
+    does the same work per frame, among different numbers of cells. Every map sees all frames once before timing, then
+    the maps take turns, frame by frame. memory: bytes that may be used (None: what the system has left).
 
     Returns `voxel_size, integrator` and `rows` of `cells` (of them, in whole blocks), `map_bytes,
     integrate_ms_median, ratio` (to the first), `skipped` ("" or why there are no figures).
@@ -77,7 +77,7 @@ def cost_by_map_size(
 
 
 def _large_map(recording: Recording, config: Config, cells: int) -> Mapper:
-    mapper = Mapper(load_config(config, **{"trust.ordered": False}))  # it sees the same frames again and again
+    mapper = Mapper(load_config(config, **{"trust.ordered": False}))  # it sees the same frames repeatedly
     random = np.random.default_rng(SEED)
     positions = np.array([frame.T_world_sensor[:3, 3] for frame in recording.frames])
     blocks = far_blocks(positions, config, -(-cells // BLOCK_CELLS))
@@ -90,9 +90,9 @@ def _large_map(recording: Recording, config: Config, cells: int) -> Mapper:
 
 
 def far_blocks(positions: NDArray[np.float64], config: Config, number: int) -> NDArray[np.int32]:
-    """Return `number` block coordinates (number, 3) about `positions` (n, 3) in metres, none within the range of any.
+    """Return `number` block coordinates (number, 3) around `positions` (n, 3) in metres, none within range of any.
 
-    They fill a cube about the ball that holds all that a camera at the positions reaches.
+    They fill a cube around the ball of all that a camera at the positions reaches.
     """
     side = 8 * config.voxel_size
     middle = (positions.min(0) + positions.max(0)) / 2
@@ -105,7 +105,7 @@ def far_blocks(positions: NDArray[np.float64], config: Config, number: int) -> N
         if len(far) >= number:
             nearest = np.argsort(np.linalg.norm((far + 0.5) * side - middle, axis=1), kind="stable")[:number]
             return far[nearest].astype(np.int32)
-    raise AssertionError("a cube that grows holds any number of blocks in the end")
+    raise AssertionError("a growing cube eventually holds any number of blocks")
 
 
 def _growing(half: float) -> Iterator[float]:
@@ -150,7 +150,7 @@ def size_table(result: dict[str, Any]) -> Table:
 
 @dataclass
 class _Flight:
-    """One map along the way, next to one that begins near the way's end and sees the same frames."""
+    """One map along the path, and one that begins near its end and sees the same frames."""
 
     settings: dict[str, Any]
     mapper: Mapper = field(init=False)
@@ -162,7 +162,7 @@ class _Flight:
         self.mapper, self.fresh = Mapper(**self.settings), Mapper(**self.settings)
 
     def add(self, frame: AnyFrame, near_end: bool, fresh_first: bool) -> None:
-        """Take in a frame, near the end both by turns."""
+        """Add a frame; near the end, to both maps in alternating order."""
         if near_end and fresh_first:
             self.fresh_times.append(self.fresh.add(frame).integrate_ms)
         self.times.append(self.mapper.add(frame).integrate_ms)
@@ -173,9 +173,9 @@ class _Flight:
 def cost_along_path(frames: int = FRAMES, tell: Progress = silent) -> dict[str, Any]:
     """Fly `frames` frames (at least 500) down the simulated hall `sim:flight`, straight on, always into new space.
 
-    Into two maps: one that rolls with the camera, one that grows without bound. Along the last tenth (at least 400
-    frames) each frame also goes into a second map that knows only what came since: old and new map take the same
-    frames at the same time, so what differs is what the flight has cost.
+    One map rolls with the camera, one grows without bound. Along the last tenth (at least 400 frames) each frame also
+    goes into a second map that knows only these: old and new map take the same frames at the same time, so their
+    difference is the cost of the flight.
 
     Returns `frames, metres, voxel_size` and `rows` of `map, start_ms` and `end_ms` (medians of the first and the last
     tenth, as flown; the first 100 frames do not count), `ratio` (old over new map; mean over pieces of 50 frames of the
@@ -202,7 +202,7 @@ def cost_along_path(frames: int = FRAMES, tell: Progress = silent) -> dict[str, 
 
 
 def _row(name: str, flight: _Flight, last: int, start_bytes: int) -> dict[str, Any]:
-    old, new = flight.times[-last:][CHUNK * 2 :], flight.fresh_times[CHUNK * 2 :]  # a new map begins with an empty one
+    old, new = flight.times[-last:][CHUNK * 2 :], flight.fresh_times[CHUNK * 2 :]  # a new map starts empty
     ratio, error, pieces = ratio_of(old, new)
     return {
         "map": name,
@@ -217,7 +217,7 @@ def _row(name: str, flight: _Flight, last: int, start_bytes: int) -> dict[str, A
 
 
 def ratio_of(old: Sequence[float], new: Sequence[float]) -> tuple[float, float, int]:
-    """Return how `old` times compare with `new` ones of the same frames: ratio, its standard error, pieces.
+    """Compare `old` times with `new` ones of the same frames: ratio, its standard error, pieces.
 
     The ratio of medians in pieces of 50 frames, on average; at least two pieces.
     """

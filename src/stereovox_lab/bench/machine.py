@@ -12,14 +12,14 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 FEATURES = {"avx2": "AVX2", "fma": "FMA", "avx512f": "AVX-512", "neon": "NEON", "sve": "SVE"}
-"""Vector instructions worth telling, as LLVM names them."""
+"""Vector instructions worth reporting, by their LLVM names."""
 
 
 def machine() -> dict[str, Any]:
     """Return `cpu`, `cores` (that this process may use), `memory_gb`, `python`, `numpy`, `numba` and `system`.
 
-    Also `features`, the vector instructions that the processor has, and `target`, the processor that kernels are
-    compiled for, as LLVM names it: this one, or what NUMBA_CPU_NAME says.
+    Also `features`, the processor's vector instructions, and `target`, the processor that kernels are
+    compiled for, by its LLVM name: this one, or NUMBA_CPU_NAME.
     """
     total = _meminfo("MemTotal")
     return {
@@ -55,7 +55,7 @@ def memory_left() -> int | None:
 
 
 def on_one_processor(make: Callable[..., T], *arguments: Any) -> T:
-    """Call `make` while this thread may use one processor only; the threads it starts keep to that one for good."""
+    """Call `make` with this thread pinned to one processor; threads it starts stay pinned."""
     if not hasattr(os, "sched_setaffinity"):
         return make(*arguments)
     allowed = os.sched_getaffinity(0)
@@ -67,7 +67,7 @@ def on_one_processor(make: Callable[..., T], *arguments: Any) -> T:
 
 
 def _this_processor(otherwise: int) -> int:
-    """Return the processor that this thread runs on: one that is busy otherwise it would have left."""
+    """Return the processor that this thread runs on: it would have left a busy one."""
     try:
         return int(Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()[36])
     except (OSError, IndexError, ValueError):

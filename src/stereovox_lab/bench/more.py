@@ -17,7 +17,7 @@ from stereovox_lab.bench.rows import Variant
 from stereovox_lab.bench.start import first_frame, first_frame_table, start_up, start_up_table
 
 USUAL_SIZE = 0.05
-"""Metres; measurements at one voxel size take that of those asked for that is nearest to it."""
+"""Metres; measurements at one voxel size use the requested size nearest to this."""
 
 
 @dataclass(frozen=True)

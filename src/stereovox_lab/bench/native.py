@@ -32,42 +32,42 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "peer_cells": (ctypes.c_int, [POINTER, POINTER, POINTER]),
     "peer_bytes": (INTEGER, [POINTER]),
 }
-"""Result and arguments of what every adapter has."""
+"""Result and argument types of functions in every adapter."""
 OF_POINTS: dict[str, tuple[Any, list[Any]]] = {
     "peer_load": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER]),
     "peer_insert": (ctypes.c_int, [POINTER]),
 }
-"""The same of those that take points."""
+"""The same for adapters that take points."""
 OF_IMAGES: dict[str, tuple[Any, list[Any]]] = {
     "peer_load_image": (ctypes.c_int, [POINTER, POINTER, ctypes.c_int, ctypes.c_int, POINTER, POINTER]),
     "peer_insert_image": (ctypes.c_int, [POINTER]),
 }
-"""The same of those that take depth images."""
+"""The same for adapters that take depth images."""
 OF_CLOUDS: dict[str, tuple[Any, list[Any]]] = {
     "peer_load_cloud": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER, POINTER]),
     "peer_insert_cloud": (ctypes.c_int, [POINTER]),
     "peer_log_odds": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER]),
 }
-"""The same of those that take clouds of a turning lidar."""
+"""The same for adapters that take clouds of a spinning lidar."""
 
 
 class NotBuilt(MissingExtra):
-    """An adapter is not where it should be."""
+    """An adapter is missing or unusable."""
 
     def __init__(self, name: str, why: str):
         StereovoxError.__init__(self, f"{name}: {why}; run benchmarks/build_peers.py and set {FOLDER} to its --out")
 
 
 class NativePeer:
-    """A map of a library in C++: cells of `voxel_size` metres.
+    """A map of a C++ library: cells of `voxel_size` metres.
 
-    Raises NotBuilt where the adapter is not there or does not fit, StereovoxError with the library's words where it
+    Raises NotBuilt if the adapter is missing or incompatible, StereovoxError with the library's message if it
     fails.
     """
 
     name: ClassVar[str]
     one_processor: ClassVar[bool] = False
-    """Whether the library starts threads that cannot be had otherwise, so that it is kept to one processor."""
+    """Whether the library starts its own threads unavoidably, so that it is pinned to one processor."""
     functions: ClassVar[dict[str, tuple[Any, list[Any]]]]
 
     def __init__(self, voxel_size: float):
@@ -76,7 +76,7 @@ class NativePeer:
         self.reach(0.0)
 
     def reach(self, max_range: float) -> None:
-        """Begin anew: what is farther than `max_range` metres clears space up to there; 0: everything is a surface."""
+        """Start a new map: points beyond `max_range` metres clear space up to there; 0: all are surfaces."""
         self._free()
         self._map = self._library.peer_new(self._voxel_size, max_range)
         if not self._map:
@@ -89,11 +89,11 @@ class NativePeer:
         return int(occupied[0]), int(free[0])
 
     def bytes(self) -> int:
-        """Return what the library says it uses."""
+        """Return the memory that the library reports."""
         return self._library.peer_bytes(self._map)
 
     def about(self) -> str:
-        """Return what the library is and how it is set."""
+        """Return the library and its settings, in words."""
         return self._library.peer_about().decode()
 
     def _call(self, function: Callable[[Any], int]) -> None:
@@ -126,7 +126,7 @@ class NativePoints(NativePeer):
         self.prepared(points, origin)()
 
     def prepared(self, points: NDArray[np.float64], origin: NDArray[np.float64]) -> Callable[[], None]:
-        """Return the call that inserts them; the library has them in its own types by then."""
+        """Return the call that inserts them; with the points already in the library's types."""
         points, origin = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(origin, np.float64)
         self._check(self._library.peer_load(self._map, _address(points), len(points), _address(origin)))
         return partial(self._call, self._library.peer_insert)
@@ -146,7 +146,7 @@ class NativeImages(NativePeer):
     def prepared_image(
         self, depth_m: NDArray[np.float32], camera: VirtualCamera, T_world_camera: NDArray[np.float64]
     ) -> Callable[[], None]:
-        """Return the call that inserts it; the library has it in its own types by then."""
+        """Return the call that inserts it; with the image already in the library's types."""
         if not isinstance(camera, PinholeCamera):
             raise StereovoxError(f"{self.name} is compared on pinhole cameras only; leave it out with --peers")
         depth_m, pose = np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(T_world_camera, np.float64)
@@ -158,7 +158,7 @@ class NativeImages(NativePeer):
 
 
 class OctomapCpp(NativePoints):
-    """OctoMap, points that share a cell made one ray."""
+    """OctoMap, with one ray for points that share a cell."""
 
     name = "octomap-cpp"
 
@@ -170,14 +170,14 @@ class Bonxai(NativePoints):
 
 
 class Ufomap(NativePoints):
-    """UFOMap 1, points that share a cell made one ray; it takes in hits on a thread of its own."""
+    """UFOMap 1, with one ray for points that share a cell; it adds hits on its own thread."""
 
     name = "ufomap"
     one_processor = True
 
 
 class WavemapCpp(NativeImages):
-    """wavemap's hashed, chunked wavelet octree: settings of its Python example, for clouds those of its Ouster's."""
+    """wavemap's hashed, chunked wavelet octree: settings of its Python example, for clouds of its Ouster example."""
 
     name = "wavemap-cpp"
     functions = NativeImages.functions | OF_CLOUDS
@@ -185,10 +185,10 @@ class WavemapCpp(NativeImages):
     def prepared_cloud(
         self, points: NDArray[np.float64], T_world_lidar: NDArray[np.float64], turning: tuple[float, float, int, int]
     ) -> Callable[[], None]:
-        """Return the call that inserts a cloud; the library has it in its own types by then.
+        """Return the call that inserts a cloud; with the cloud already in the library's types.
 
         points: (N, 3) metres along the axes of a lidar that turns about z. turning: lowest and highest elevation in
-        radians, number of beams above each other, number of directions.
+        radians, number of beams in elevation, number of directions.
         """
         points, pose = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(T_world_lidar, np.float64)
         numbers = np.array(turning, np.float64)
@@ -197,7 +197,7 @@ class WavemapCpp(NativeImages):
         return partial(self._call, self._library.peer_insert_cloud)
 
     def log_odds(self, points: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the log-odds (N,) of the cells that points (N, 3) in the world lie in, 0: nothing known."""
+        """Return the log-odds (N,) of the cells that points (N, 3) in the world lie in, 0: unknown."""
         points, found = np.ascontiguousarray(points, np.float64), np.zeros(len(points), np.float32)
         self._check(self._library.peer_log_odds(self._map, _address(points), len(points), _address(found)))
         return found

@@ -20,7 +20,7 @@ from stereovox_lab.bench.results import Table
 from stereovox_lab.bench.rows import Variant, median
 
 PASSES = 4
-"""The first is not timed; threads take turns in each."""
+"""Passes over the frames; the first is not timed; thread counts take turns in each."""
 SIZES = ((8, 6), (160, 120), (320, 240), (640, 480))
 """Width and height of the images; the field of view is the same."""
 DEPTH_M = 0.5
@@ -36,7 +36,7 @@ def thread_scaling(
     threads: Sequence[int] | None = None,
     tell: Progress = silent,
 ) -> dict[str, Any]:
-    """Time the frames at each voxel size on 1 to all cores (or `threads`), by turns.
+    """Time the frames at each voxel size on 1 to all cores (or `threads`), taking turns.
 
     Returns `integrator` and `rows` of `voxel_size, threads, integrate_ms_median, faster`: the median on one thread (the
     first of `threads`) divided by this one.
@@ -80,15 +80,15 @@ def thread_table(result: dict[str, Any]) -> Table:
 def overhead(
     config: Config, repeats: int = 400, sizes: Sequence[tuple[int, int]] = SIZES, tell: Progress = silent
 ) -> dict[str, Any]:
-    """Time `Mapper.add` on images in which a single pixel has a value, sizes by turns.
+    """Time `Mapper.add` on images in which a single pixel has a value, with sizes taking turns.
 
-    With a few pixels there is nothing to do for kernels, so that all of it is overhead. With more, kernels look through
-    the pixels, which takes time in proportion to their number: the part that does not grow with it is the overhead, or
-    a little more than that.
+    Small images give kernels nothing to do, so that all of it is overhead. In larger ones kernels scan the pixels, in
+    time proportional to their number: the part that does not grow with it is the overhead, or slightly more.
+
 
     Returns microseconds: `rows` of `width, height, add_us` (least), `add_us_median`, `depth_us` and `integrate_us`
-    (medians of what the report tells); and `fixed_us`: a straight line through the least times, where it meets zero
-    pixels (None with a single size).
+    (medians from the report); and `fixed_us`: the intercept at zero pixels of a straight line through the least times
+    (None with a single size).
     """
     frames = [empty_frame(width, height) for width, height in sizes]
     mappers = [Mapper(load_config(config, **{"trust.min_valid_share": 0})) for _ in frames]
@@ -104,7 +104,7 @@ def overhead(
 
 
 def empty_frame(width: int, height: int) -> Frame:
-    """Return a frame in millimetres (uint16) without any value, but for one pixel in its middle."""
+    """Return a frame in millimetres (uint16) without any value, except one pixel in its middle."""
     depth = np.zeros((height, width), np.uint16)
     depth[height // 2, width // 2] = round(1000 * DEPTH_M)
     camera = PinholeCamera.from_field_of_view(width, height, 60.0, baseline=0.05)

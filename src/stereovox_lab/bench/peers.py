@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other mapping libraries behind one small interface, so that `bench` gives them the same frames as stereovox.
+"""Other mapping libraries behind one small interface, so that `bench` feeds them the same frames as stereovox.
 
-octomap-python and pyoctomap each bring their own OctoMap 1.10. They live in one process without a clash (the first is
-linked statically, the second's libraries carry a hash in their names); alone, together and in either order they give
-the same trees.
+octomap-python and pyoctomap each bring their own OctoMap 1.10. They coexist in one process (the first is linked
+statically, the second's libraries have a hash in their names); alone, together and in either order they give the same
+trees.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ PEERS = {
 """Libraries by name; other packages add theirs with entry points in the group `stereovox.peers`."""
 
 USUAL = ("octomap", "pyoctomap", "wavemap")
-"""Default peers, as far as they are installed."""
+"""Default peers, if installed."""
 
 WAVEMAP_FROM = "git+https://github.com/ethz-asl/wavemap#subdirectory=library/python"
-"""Where its own pages say pip finds it; it is not on PyPI."""
+"""Its documented pip source; it is not on PyPI."""
 UNKNOWN = 1e-6
-"""Log-odds nearer to zero than this are no evidence in wavemap's maps, whose cells are sums of wavelets."""
+"""Log-odds nearer to zero than this count as no evidence in wavemap's maps, whose cells are sums of wavelets."""
 OCTOMAP_SETTINGS = "OctoMap's defaults: p 0.7 for a hit, 0.4 for a miss, from 0.12 to 0.97, occupied above 0.5"
 TREE_DEPTH = 16
 """Levels of an octree of OctoMap; a leaf at this depth is one cell."""
@@ -53,10 +53,10 @@ TREE_DEPTH = 16
 class Peer(Protocol):
     """Map of another library, a plug-in of `stereovox bench`.
 
-    Two more methods are used where it has them. `reach(max_range)` is called once, before the first frame, where
-    what is farther than so many metres clears space up to there; a map without it is not timed on such frames.
+    Two optional methods: `reach(max_range)` is called once, before the first frame, if points beyond this range shall
+    clear space up to it; a map without it is not timed on such frames.
     `prepared(points, origin)` returns a function that inserts them, and only that function is timed (`prepared_image`
-    for depth images). A map with `one_processor` True is kept to one, with all threads that it starts.
+    for depth images). A map with `one_processor` True is pinned to one, with all its threads.
 
     Args:
         voxel_size: Cell size in metres.
@@ -80,7 +80,7 @@ class Peer(Protocol):
         """Count cells.
 
         Returns:
-            The numbers of occupied and of free cells; a node that stands for many cells counts as that many.
+            The numbers of occupied and of free cells; a node that covers many cells counts as that many.
         """
         ...
 
@@ -95,7 +95,7 @@ class Peer(Protocol):
 
 @runtime_checkable
 class ImagePeer(Protocol):
-    """Peer that takes depth images in place of points.
+    """Peer that takes depth images instead of points.
 
     Args:
         voxel_size: Cell size in metres.
@@ -137,7 +137,7 @@ class ImagePeer(Protocol):
 
 @runtime_checkable
 class CellsPeer(Protocol):
-    """Peer whose cells can be read, as `stereovox benchmark` needs it.
+    """Peer with readable cells, as required by `stereovox benchmark`.
 
     occupied_above: probability above which a cell is occupied, below which it is free. about: the library's settings.
     package: the distribution whose version is reported.
@@ -156,9 +156,9 @@ PeerClass = type[Peer] | type[ImagePeer]
 
 
 def find_peer(name: str) -> PeerClass:
-    """Return the class registered as `name`, or for `module:Class` that class of a module that Python finds.
+    """Return the class registered as `name`, or for `module:Class` that class of an importable module.
 
-    Raises ConfigError, one line, that suggests a known name or tells what could not be imported or what a class lacks.
+    Raises ConfigError, one line, that suggests a known name or reports the failed import or the missing method.
     """
     known = registry.names("peers", PEERS)
     if ":" not in name and name not in known:
@@ -171,7 +171,7 @@ def find_peer(name: str) -> PeerClass:
 
 @contextmanager
 def blamed(who: str, kind: type[StereovoxError] = StereovoxError) -> Iterator[None]:
-    """Let what a peer raises inside be one line of this `kind` that names it; errors of stereovox are one already."""
+    """Turn a peer's exceptions into one line of this `kind` that names it; stereovox errors already are."""
     try:
         yield
     except (StereovoxError, MemoryError):
@@ -182,7 +182,7 @@ def blamed(who: str, kind: type[StereovoxError] = StereovoxError) -> Iterator[No
 
 
 def installed(names: Sequence[str] = USUAL) -> tuple[list[str], list[str]]:
-    """Return those of `names` that can be used here, and a line for each of the others that says what to install."""
+    """Return the usable ones of `names`, and for each other one a line about what to install."""
     here, missing = [], []
     for name in names:
         try:
@@ -202,7 +202,7 @@ def _class_in(name: str) -> PeerClass:
 
 
 def _check_class(name: str, kind: Any) -> None:
-    """Raise ConfigError for what is no class, or one that lacks a method."""
+    """Raise ConfigError for a non-class, or a class without a required method."""
     if not isinstance(kind, type):
         raise ConfigError(f"peer '{name}' is not a class but {type(kind).__name__}; write module:Class")
     wanted = ("insert_image" if hasattr(kind, "insert_image") else "insert", "counts", "bytes")
@@ -220,7 +220,7 @@ class OctomapPython:
     """
 
     discretize = True
-    """True: points that share a cell become one ray. False: one ray a point."""
+    """True: points that share a cell become one ray. False: one ray per point."""
     occupied_above = 0.5
     about = f"{OCTOMAP_SETTINGS}; points that share a cell made one ray"
     package = "octomap-python"
@@ -246,19 +246,19 @@ class OctomapPython:
         return _cells_of(lambda file: self._tree.write(os.fsencode(file)))
 
     def bytes(self) -> int:
-        """Return what `memoryUsage` tells: the nodes and their child arrays."""
+        """Return `memoryUsage`: the nodes and their child arrays."""
         return self._tree.memoryUsage()
 
 
 class OctomapPythonRays(OctomapPython):
-    """octomap-python with one ray a point: exact, and slow."""
+    """octomap-python with one ray per point: exact, and slow."""
 
     discretize = False
     about = f"{OCTOMAP_SETTINGS}; one ray a point"
 
 
 class PyOctomap:
-    """pyoctomap with the settings of `OctomapPython`, points that share a cell made one ray."""
+    """pyoctomap with the settings of `OctomapPython`, with one ray for points that share a cell."""
 
     occupied_above = 0.5
     about = f"{OCTOMAP_SETTINGS}; points that share a cell made one ray"
@@ -273,7 +273,7 @@ class PyOctomap:
         self._max_range = max_range
 
     def insert(self, points: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
-        """Cast a ray to every cell that holds a point."""
+        """Cast a ray to every cell that contains a point."""
         self._tree.insertPointCloud(points, origin, self._max_range, False, True)
 
     def counts(self) -> tuple[int, int]:
@@ -286,7 +286,7 @@ class PyOctomap:
         return _cells_of(lambda file: self._tree.write(os.fspath(file)))
 
     def bytes(self) -> int:
-        """Return what `memoryUsage` tells: the nodes and their child arrays."""
+        """Return `memoryUsage`: the nodes and their child arrays."""
         return self._tree.memoryUsage()
 
 
@@ -300,7 +300,7 @@ class Wavemap:
     about = "its Python example: range sigma 0.01 m, scaling 0.2 free and 0.4 occupied, occupied above 0.5"
     package = "pywavemap"
     NEAREST_M = 0.1
-    """Where depths begin; nearer ones, and so zeros, have no value for wavemap."""
+    """Least depth; nearer ones, and so zeros, have no value for wavemap."""
 
     def __init__(self, voxel_size: float):
         try:
@@ -345,7 +345,7 @@ class Wavemap:
         return np.concatenate([cells for cells, _ in known]), np.concatenate([values for _, values in known])
 
     def _layers(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float32]]]:
-        """Yield all cells (N, 3) that can have been seen and their values (N,), a layer at a time."""
+        """Yield all cells (N, 3) that may have been seen and their values (N,), layer by layer."""
         far = self._reach * self._widest
         low = np.floor((np.min(self._seen, axis=0) - far) / self._voxel_size).astype(int)
         high = np.ceil((np.max(self._seen, axis=0) + far) / self._voxel_size).astype(int)
@@ -355,11 +355,11 @@ class Wavemap:
             yield layer, np.asarray(self._map.get_cell_values(layer))
 
     def bytes(self) -> int:
-        """Return what `memory_usage` tells."""
+        """Return `memory_usage`."""
         return self._map.memory_usage
 
     def _use_camera(self, camera: VirtualCamera, reach: float) -> None:
-        """Set up for this camera; cells beyond `reach` metres, where the images end, are not looked at."""
+        """Set up for this camera; cells beyond `reach` metres, where the images end, are skipped."""
         if not isinstance(camera, PinholeCamera):
             raise StereovoxError("wavemap is compared on pinhole cameras only; leave it out with --peers")
         columns, rows = camera.ray_slopes()
@@ -378,7 +378,7 @@ class Wavemap:
 
 
 class MissingPackage(MissingExtra):
-    """A library that no extra of stereovox brings is not installed."""
+    """A library outside stereovox's extras is not installed."""
 
     def __init__(self, library: str, source: str):
         StereovoxError.__init__(self, f"{library} is not installed; run: pip install '{source}'")
@@ -399,7 +399,7 @@ def _cells_of(write: Callable[[Path], object]) -> tuple[NDArray[np.integer], NDA
 
 
 def _count(leafs: Iterator[tuple[int, bool]]) -> tuple[int, int]:
-    """Add up the cells of leafs given as depth and whether occupied; a pruned leaf stands for 8 cells a level."""
+    """Count the cells of leaves given as depth and whether occupied; a pruned leaf covers 8 cells per level."""
     cells = [0, 0]
     for depth, occupied in leafs:
         cells[not occupied] += 8 ** (TREE_DEPTH - depth)

@@ -11,7 +11,7 @@ from stereovox_lab.bench.machine import machine_line
 
 LIBRARY = "stereovox"
 QUIET = 0.9
-"""Share of a processor that a thread gets at least on a quiet machine."""
+"""Least share of a processor that a thread gets on a quiet machine."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def format_table(result: dict[str, Any]) -> str:
 
 
 def comparison_table(result: dict[str, Any]) -> Table:
-    """Return the result of `bench` as a table: a group for each voxel size, first what peers are compared with."""
+    """Return the result of `bench` as a table: a group for each voxel size, first the row peers are compared with."""
     compared = ("stereovox is",) if any(result["ratio"].values()) else ()
     whole = ("whole",) if any("add_ms_median" in row for row in result["rows"]) else ()
     times = ("ms/frame", "p90", "p99", *whole)
@@ -72,7 +72,7 @@ def is_ours(row: dict[str, Any]) -> bool:
 
 
 def rows_by_size(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return all rows of a result by the voxel size as `ratio` names it: that which peers are compared with, then
+    """Return all rows of a result by the voxel size as `ratio` names it: the one that peers are compared with, then
     our other ones, then peers.
     """
     ours = [row for row in result["rows"] if is_ours(row)]
@@ -88,7 +88,7 @@ def _title(result: dict[str, Any]) -> str:
 
 
 def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None, whole: bool) -> tuple[str, ...]:
-    """Return the cells of a line; `ratio` is None if there are no peers, and so no column for it."""
+    """Return the cells of a line; `ratio` is None if there are no peers, and then has no column."""
     faster = () if ratio is None else (_faster(ratio.get(row["library"])),)
     add = (f"{row['add_ms_median']:.2f}" if "add_ms_median" in row else "",) if whole else ()
     return (

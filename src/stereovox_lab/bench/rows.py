@@ -25,12 +25,12 @@ from stereovox_lab.bench.results import format_table as format_table
 MIN_FRAMES = 5
 """Minimum number of frames of a peer, however long they take."""
 PASSES = 3
-"""stereovox maps all frames this many times, and once more after each peer, to spread the machine's variations."""
+"""stereovox maps all frames this many times, and once more after each peer, to average out machine variations."""
 ENOUGH_S = 5.0
 """A variant of stereovox makes no further pass once its timed frames took this many seconds."""
 
 BEYOND = 2.0
-"""Where peers get what is beyond the maximum range, in maximum ranges: they clear the first of these."""
+"""Distance, in maximum ranges, at which peers get points beyond the range: they clear up to the first."""
 
 T = TypeVar("T")
 SoFar = Callable[[dict[str, Any]], None]
@@ -46,11 +46,11 @@ class Variant:
 
     @property
     def library(self) -> str:
-        """What its rows are called: `stereovox`, or `stereovox-ray`."""
+        """Name of its rows: `stereovox`, or `stereovox-ray`."""
         return LIBRARY if self.integrator == "projective" else f"{LIBRARY}-{self.integrator}"
 
     def config(self, voxel_size: float, max_range: float | None = None) -> Config:
-        """Return the default profile's settings with those of this variant; raises ConfigError."""
+        """Return the default profile's settings with this variant's; raises ConfigError."""
         more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
         return load_config(voxel_size=float(voxel_size), threads=self.threads, integrator=self.integrator, **more)
 
@@ -72,7 +72,7 @@ class _Watch:
 
     @property
     def share(self) -> float:
-        """How many processors the calls kept busy: less than 1 where others were in the way."""
+        """Number of processors the calls kept busy: less than 1 if other programs interfered."""
         return round(self.cpu_ms / max(sum(self.times_ms), 1e-6), 3)
 
 
@@ -80,7 +80,7 @@ class _Watch:
 class _Limits:
     """When a peer may stop: after `seconds` of inserting, but not before `MIN_FRAMES` frames.
 
-    range_m: where rays of what is beyond the maximum range end; 0: frames have no such pixels.
+    range_m: end of rays beyond the maximum range; 0: frames have no such pixels.
     """
 
     seconds: float
@@ -104,18 +104,18 @@ def bench(
     """Time stereovox and `peers` (names in `PEERS`, or `module:Class`) on the same frames at each voxel size in metres.
 
     Same pixels: those without a value and those beyond `max_range` (None: the default profile's) are left out for all,
-    ours included, so nobody clears space through them. Same poses: made exactly rigid once. All frames (at most
-    `frames_limit`) are in memory before the clock starts.
+    including ours, so no library clears space through them. Same poses: made exactly rigid once. All frames (at most
+    `frames_limit`) are in memory before timing starts.
 
     Timed: for stereovox the `integrate_ms` of each frame that `Mapper.add` reports, after all frames went once through
-    a map that is thrown away, so that kernels are compiled; several passes, one before each peer (only one where that
-    takes seconds), and their frames together give the figures. Its depth preparation stands apart as
-    `depth_ms_median`, the whole call as `add_ms_median`. For a peer its insertion alone, in one thread, after one frame
-    into a map that is thrown away; its points are made before. What a peer's Python binding does with the points is
-    part of it: a Python user pays that, a C++ program would not.
+    a discarded map, so that kernels are compiled; several passes, one before each peer (only one if that takes
+    seconds), pooled. Its depth preparation is separate as `depth_ms_median`, the whole call as `add_ms_median`. For a
+    peer its insertion alone, in one thread, after one frame into a discarded map; its points are made before. Work of a
+    peer's Python binding on the points is included: a Python user pays for it, a C++ program would not.
 
-    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` reports how
-    many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
+
+    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` reports the
+    number done, and if that is fewer than ours, its cells and bytes cannot be compared.
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, integrate_ms_p99,
     occupied, free, map_bytes, cpu_share` (processors kept busy while timed; a single thread that got clearly less than
@@ -124,7 +124,7 @@ def bench(
     first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and
     free below 0.3 for stereovox, above and below 0.5 for the others.
     Raises ConfigError for an unknown or unusable peer or bad setting, MissingExtra for a peer that is not installed,
-    StereovoxError when no frame can be used or a peer fails: one line each.
+    StereovoxError if no frame is usable or a peer fails: one line each.
     """
     variants = [Variant(threads=threads), *variants]
     configs = _configs(voxel_sizes, variants, max_range)
@@ -134,7 +134,7 @@ def bench(
 
 
 def find_peers(names: Sequence[str], voxel_size: float) -> dict[str, PeerClass]:
-    """Return peers by name; one that is missing or cannot be made shows here, before a long recording is read."""
+    """Return peers by name; a missing or failing one is reported here, before a long recording is read."""
     kinds = {name: find_peer(name) for name in names}
     for name, kind in kinds.items():
         with blamed(f"peer '{name}' cannot be made", ConfigError):
@@ -152,10 +152,10 @@ def compare(
     budget_s: float = 60.0,
     so_far: SoFar = lambda result: None,
 ) -> dict[str, Any]:
-    """Do what `bench` does with frames in memory; the first of `variants` is what peers are compared with.
+    """Do as `bench` with frames in memory; peers are compared with the first of `variants`.
 
     so_far: called with the result after each voxel size, so that a long run can be stopped.
-    Where the recording holds pixels beyond the maximum range, they clear space up to there; the result's `far_share`
+    If the recording has pixels beyond the maximum range, they clear space up to it; the result's `far_share`
     is their share of all pixels, and peers that cannot do that are left out: `not_clearing` names them.
     """
     sizes = _configs(voxel_sizes, variants, max_range)
@@ -206,7 +206,7 @@ def _timed(
     limits: _Limits,
     tell: Progress,
 ) -> list[dict[str, Any]]:
-    """Fly stereovox and let each peer do the frames, by turns; return the peers' rows."""
+    """Run stereovox and each peer on the frames, taking turns; return the peers' rows."""
     for flight in flights:
         flight.fly("warming up")
     waiting, rows = list(peers.items()), []
@@ -223,7 +223,7 @@ def _timed(
 
 
 class _Flights:
-    """The frames through stereovox, as often as it is flown: each time into a new map."""
+    """Passes of the frames through stereovox, each into a new map."""
 
     def __init__(self, variant: Variant, config: Config, frames: list[Frame], tell: Progress):
         self._variant, self._config, self._frames, self._tell = variant, config, frames, tell
@@ -233,11 +233,11 @@ class _Flights:
 
     @property
     def seconds(self) -> float:
-        """How long the timed frames took."""
+        """Duration of the timed frames."""
         return sum(self._watch.times_ms) / 1e3
 
     def fly(self, text: str, timed: bool = False) -> None:
-        """Add all frames to a new map, and remember the times if they are `timed`."""
+        """Add all frames to a new map, and record the times if `timed`."""
         mapper, threads = Mapper(self._config), self._variant.threads
         where = f"{self._variant.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
         self._tell(0, len(self._frames), f"{where}, {text}{'' if timed else ': compiling, if need be'}")
@@ -251,7 +251,7 @@ class _Flights:
         self._map = {"occupied": counts["occupied"], "free": counts["free"], "map_bytes": mapper.map.memory_bytes}
 
     def row(self) -> dict[str, Any]:
-        """Return the row of this way to run stereovox."""
+        """Return the row of this variant."""
         row = _row(self._variant.library, self._config, self._variant.threads, [r.integrate_ms for r in self._reports])
         more = {
             "frames": len(self._frames),
@@ -285,7 +285,7 @@ def _time_peer(
 
 
 def _new(kind: PeerClass, config: Config, limits: _Limits) -> Peer | ImagePeer:
-    """Return an empty map, which knows where rays end if some have no surface."""
+    """Return an empty map, set to where rays without a surface end."""
     peer: Any = kind(config.voxel_size)
     if limits.range_m:
         peer.reach(limits.range_m)
@@ -293,9 +293,9 @@ def _new(kind: PeerClass, config: Config, limits: _Limits) -> Peer | ImagePeer:
 
 
 def insertion(peer: Any, frame: Frame, config: Config, range_m: float) -> Callable[[], None]:
-    """Return the call that inserts a frame into a peer, and is timed; all that it needs is made here.
+    """Return the timed call that inserts a frame into a peer; its inputs are prepared here.
 
-    range_m: where the peer was told that rays end (`reach`), for pixels beyond it; 0: these have no value.
+    range_m: end of rays set by `reach`, for pixels beyond it; 0: these have no value.
     """
     image, beyond_m = prepare(frame, config), BEYOND * range_m
     if isinstance(peer, ImagePeer):

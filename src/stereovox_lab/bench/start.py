@@ -22,7 +22,7 @@ from stereovox_lab.bench.frames import Progress, silent
 from stereovox_lab.bench.results import Table
 
 FIRST_FRAMES = 5
-"""So many frames until every kernel has run: some are needed only when a map is no longer new."""
+"""Frames until every kernel has run: some are needed only once a map is no longer new."""
 FIRST_FRAME = """
 import pickle, sys, time
 with open(sys.argv[1], "rb") as file:
@@ -36,7 +36,7 @@ for frame in frames:
     print(time.perf_counter() - start, flush=True)
 print(mapper.map.counts()["occupied"])
 """
-"""What a fresh process does; the file holds settings and frames. It writes a line when a frame is in."""
+"""Program of a fresh process; the file has settings and frames. It writes a line per frame added."""
 STARTS = {
     "python alone": ["-c", "pass"],
     "import stereovox": ["-c", "import stereovox"],
@@ -47,11 +47,11 @@ STARTS = {
 def first_frame(frames: Sequence[Frame], config: Config, warm_runs: int = 3, tell: Progress = silent) -> dict[str, Any]:
     """Time fresh processes, from their start until the first of `frames` is in the map, and until the fifth is.
 
-    First without any compiled kernel, then `warm_runs` times with those that this left: the quickest counts. Of fewer
-    than five frames all are taken.
+    First without compiled kernels, then `warm_runs` times with the cached ones: the fastest counts. If there are fewer
+    than five frames, all are used.
 
     Returns seconds: `cold_s`, `warm_s` until the first frame is in; `cold_all_s`, `warm_all_s` until all are;
-    `compile_s`, which is what lies between these two; `cold_add_s`, `warm_add_s`: the first `Mapper.add`; `last_add_s`;
+    `compile_s`, the difference of these two; `cold_add_s`, `warm_add_s`: the first `Mapper.add`; `last_add_s`;
     and `frames` (how many), `voxel_size`, `integrator`, `occupied` (cells, of the cold and the warm runs the same).
     """
     first = frames[:FIRST_FRAMES]
@@ -119,9 +119,9 @@ def start_up(repeats: int = 7, tell: Progress = silent) -> dict[str, Any]:
 
 @contextmanager
 def _process(words: Sequence[str], environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
-    """Start Python, with this very stereovox, wherever it lies; it never outlives the block.
+    """Start Python, with this very stereovox, wherever it is; it never outlives the block.
 
-    A terminal's Ctrl-C does not reach it (it has a session of its own): we get it, and end it without a word.
+    A terminal's Ctrl-C does not reach it (it has its own session): we get it, and end the process silently.
     """
     here = str(Path(stereovox.__file__).parents[1])
     paths = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))

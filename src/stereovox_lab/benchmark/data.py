@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data sets of the benchmark: frames to map, and the truth by which maps of them are judged."""
+"""Data sets of the benchmark: frames to map, and the truth by which their maps are judged."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from stereovox_lab.bench.frames import Progress, silent
 from stereovox_lab.benchmark.seen import END, FREE, Seen, truth_of, without
 
 BUILT_IN = ("sim:room?camera=d435", "sim:apartment?camera=d435", "sim:room?camera=kinect")
-"""What is run where no data set is named: everybody has these."""
+"""Default data sets: everybody has these."""
 SEEDS = (7001, 7002, 7003)
-"""Of the noise of a simulated camera that is named without one; no default of stereovox was chosen on them."""
+"""Default noise seeds of a simulated camera; no default of stereovox was chosen on them."""
 MOST_FRAMES = 100
-"""Frames of a recording that are used, those held out among them: of a longer one evenly chosen ones."""
+"""Most frames used of a recording, including held-out ones; longer ones are sampled evenly."""
 HELD_OUT = 10
-"""One frame in so many of a recording with depth alone is held out, beginning with the sixth."""
+"""One in this many frames of a depth-only recording is held out, starting with the sixth."""
 MARGIN = (2.0, 0.02)
-"""Cells, and share of the depth, before the end of a held-out ray up to which cells are free."""
+"""Margin in cells, and as a share of depth, between free cells and the end of a held-out ray."""
 TOLERANCE = 1
 SIMULATED, LIDAR, DEPTH = "exact geometry", "lidar", "held-out frames"
 """Kinds of truth."""
@@ -47,8 +47,8 @@ SETTINGS = {SIMULATED: (0.05, 5.0), LIDAR: (0.2, 20.0), DEPTH: (0.05, 5.0)}
 class Task:
     """One recording to map and its truth.
 
-    name: as asked for; run: which seed; kind: of truth. frames: depth images to map. held_out: how many others made the
-    truth, and dropped: cells that some of these call occupied and others free.
+    name: as given; run: the seed; kind: of truth. frames: depth images to map. held_out: number of others that made the
+    truth; dropped: cells on which these contradict each other.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Task:
     dropped: int = 0
 
     def about(self) -> dict[str, Any]:
-        """Return what a reader must know of it, fit for JSON; `truth_sha256` tells truths apart."""
+        """Return its description for readers, fit for JSON; `truth_sha256` identifies the truth."""
         cells = self.truth.cells.astype("<i8").tobytes() + self.truth.occupied.tobytes()
         return {
             "name": self.name,
@@ -88,10 +88,10 @@ def tasks_of(
     most_frames: int = MOST_FRAMES,
     tell: Progress = silent,
 ) -> Iterator[Task]:
-    """Yield the tasks of a data set: of a simulation one for each seed, of a recording one.
+    """Yield the tasks of a data set: one per seed of a simulation, one per recording.
 
     location: what `open_source` takes. voxel_size, max_range: in metres; None: those of `SETTINGS`. frames: as `A:B:S`.
-    Raises StereovoxError, one line, for what cannot be opened, frames that cannot be used, and too few to hold out.
+    Raises StereovoxError, one line, if data cannot be opened, frames are unusable, or too few to hold out.
     """
     source: Any = open_source(location)
     picked = _picked(len(source), source.name, frames, most_frames)
@@ -116,7 +116,7 @@ def _kind_of(source: Any) -> str:
 
 
 def _held_out(name: str, frames: Sequence[Frame], config: Config) -> Task:
-    """Return the task of mapping nine frames of ten, judged by what the tenth ones see; what these deny is dropped."""
+    """Return the task of mapping nine frames of ten, judged by the tenth ones; contradictions are dropped."""
     held, kept = frames[HELD_OUT // 2 :: HELD_OUT], [f for n, f in enumerate(frames) if n % HELD_OUT != HELD_OUT // 2]
     if not held:
         raise StereovoxError(f"{name}: {len(frames)} usable frames; give at least {HELD_OUT} to hold one out")
@@ -131,14 +131,14 @@ def _held_out(name: str, frames: Sequence[Frame], config: Config) -> Task:
 
 
 def raw(config: Config) -> Config:
-    """Return the settings by which libraries get depths as the camera gives them."""
+    """Return the settings that give libraries the camera's raw depths."""
     return load_config(config, **{"depth.denoise": False})
 
 
 def _simulated(
     source: Simulation, location: str, picked: Sequence[int], config: Config, seeds: Sequence[int], tell: Progress
 ) -> Iterator[Task]:
-    """Yield a task for each seed; the truth is that of all that exact depth images of the same frames see."""
+    """Yield a task for each seed; the truth is what exact depth images of the same frames see."""
     size, reach = config.voxel_size, config.max_range
     exact, seen = exact_occupancy(source.scene, size), Seen(size, reach)
     for n, i in enumerate(picked):

@@ -23,28 +23,28 @@ from stereovox_lab.benchmark.data import Task, raw
 
 OURS = "stereovox"
 USUAL = (OURS, "octomap", "pyoctomap", "wavemap")
-"""Libraries that are compared if none is named, as far as they are installed."""
+"""Libraries compared by default, if installed."""
 HAIR = 1e-4
-"""A cell of a library with one threshold is free below it, less so much."""
+"""A cell of a library with one threshold is free below that minus this."""
 WIDEST = 30.0
-"""Limit of the log-odds of maps that are read from other libraries."""
+"""Limit of the log-odds of maps from other libraries."""
 
 
 class Contestant(Protocol):
-    """A map that is being made of one task. ms: processor time of each frame, of all threads."""
+    """A map being made for one task. ms: processor time of each frame, of all threads."""
 
     ms: list[float]
 
     def add(self, frame: Frame) -> None:
-        """Take a frame in."""
+        """Add a frame."""
         ...
 
     def map(self) -> VoxelMap:
-        """Return the map as a voxel map, by whose states it is judged."""
+        """Return the map as a voxel map, judged by its states."""
         ...
 
     def bytes(self) -> int:
-        """Return the bytes that the library says its map takes."""
+        """Return the map's bytes as reported by the library."""
         ...
 
 
@@ -59,11 +59,11 @@ class Library:
 
 
 def find_libraries(names: Sequence[str] | None = None) -> tuple[list[Library], list[str]]:
-    """Return libraries by name, and for each usual one that is not installed a line that says how to get it.
+    """Return libraries by name, and for each default one that is not installed a line about how to get it.
 
     names: `stereovox`, `stereovox:PROFILE` (a profile or a file of settings), a peer of `stereovox bench`, or
-    `module:Class`; None: the usual ones. Raises ConfigError for an unknown one and one whose cells cannot be read,
-    MissingExtra for one that is named and not installed.
+    `module:Class`; None: the usual ones. Raises ConfigError for an unknown library and one with unreadable cells,
+    MissingExtra for a named one that is not installed.
     """
     found, missing = [], []
     for name in dict.fromkeys(USUAL if names is None else names):
@@ -80,7 +80,7 @@ def find_libraries(names: Sequence[str] | None = None) -> tuple[list[Library], l
 
 def _ours(name: str) -> Library:
     profile = name.partition(":")[2] or "default"
-    load_config(profile)  # an unknown one shows here, before the work
+    load_config(profile)  # fails here for an unknown one, before the work
     about = f"profile {profile}, one thread; its own depth preparation is part of it"
     return Library(name, lambda task: _Stereovox(profile, task), stereovox.__version__, about)
 
@@ -121,7 +121,7 @@ class _Stereovox:
 
 
 class _Peer:
-    """Gets every valid pixel; what is farther than the range clears space up to it where the library can do that."""
+    """Gets every valid pixel; pixels beyond the range clear space up to it if the library supports that."""
 
     def __init__(self, name: str, kind: Any, task: Task):
         self._name, self._peer = name, kind(task.voxel_size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run the benchmark: every library maps every recording, and each map is judged by the same truth."""
+"""Run the benchmark: every library maps every recording, and all maps are judged by the same truth."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def run_benchmark(
 
     data: recordings and simulations as `open_source` takes them; none: `BUILT_IN`. libraries: see `find_libraries`.
     voxel_size, max_range: in metres, for all data; None: by the kind of truth. frames: as `A:B:S`, of each recording.
-    seeds: of simulated noise. command: what was typed, to be kept. so_far: called after each map.
+    seeds: of simulated noise. command: the typed command, for the record. so_far: called after each map.
     Returns `protocol, command, machine, libraries, not_installed, data` (see `Task.about`), `rows` (one for each map)
     and `means` (over the runs of a data set): figures as `figures_of` names them.
-    Raises StereovoxError, one line, for unknown libraries, data that cannot be used, and a library that fails.
+    Raises StereovoxError, one line, for unknown libraries, unusable data, and a failing library.
     """
     found, missing = find_libraries(libraries)
     about = [{"name": one.name, "version": one.version, "settings": one.settings} for one in found]
@@ -62,8 +62,8 @@ def run_benchmark(
 def judged(library: Library, task: Task, tell: Progress = silent) -> dict[str, Any]:
     """Let a library map a task, and return the row of figures.
 
-    A frame that stereovox refuses is left out of its map, and counted; every map is judged as bare cells, in the states
-    that the library gives them.
+    A frame that stereovox refuses is left out of its map, and counted; every map is judged by its cells' states
+    according to the library.
     """
     contestant, refused = library.make(task), 0
     for n, frame in enumerate(task.frames):
@@ -75,7 +75,7 @@ def judged(library: Library, task: Task, tell: Progress = silent) -> dict[str, A
     made = contestant.map()
     bare = VoxelMap.from_cells(made.config, *made.cells())
     scores = score(bare, task.truth, made.config.map.occupied_above)
-    times = contestant.ms[1:] or contestant.ms  # the first may compile
+    times = contestant.ms[1:] or contestant.ms  # the first may include compilation
     return {
         "library": library.name,
         "data": task.name,
@@ -89,7 +89,7 @@ def judged(library: Library, task: Task, tell: Progress = silent) -> dict[str, A
 
 
 def figures_of(scores: Scores) -> dict[str, float | None]:
-    """Return the figures of a table; None if there is nothing to divide by.
+    """Return the figures of a table; None for a division by zero.
 
     wrongly_free, wrongly_free_alone: of the surface cells that the map knows, the shares called free, and free with
     nothing tentative or occupied within one cell. thin_lost: of the surface cells of lines (`Thickness`), the share
@@ -115,7 +115,7 @@ def figures_of(scores: Scores) -> dict[str, float | None]:
 
 
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each data set and library, in order: means over the runs, and `spread`, highest less lowest."""
+    """Return a row for each data set and library, in order: means over the runs, and `spread`, highest minus lowest."""
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault((row["data"], row["library"]), []).append(row)

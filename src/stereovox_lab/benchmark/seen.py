@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What depth images tell of cells: in which their pixels end, and which they see through."""
+"""Evidence of depth images on cells: where their pixels end, and what they see through."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.storage.blocks import SIDE, BlockPool
 
 FREE, END = 1, 2
-"""Marks of a cell: seen through by a frame in which nothing ends in it; some pixel ends in it."""
+"""Marks of a cell: seen through by a frame in which no pixel ends in it; some pixel ends in it."""
 SURE = 3.0
 """Log-odds of a truth's cells."""
 
 
 class Seen:
-    """Collects what depth images see up to `max_range` metres from the camera, in cells of `voxel_size` metres.
+    """Collects cells seen by depth images up to `max_range` metres from the camera, of `voxel_size` metres.
 
-    margin: cells and share of the depth that a cell must lie before the end of its pixel's ray to be seen through.
+    margin: least distance of a seen-through cell before the end of its pixel's ray, in cells and as a share of depth.
     """
 
     def __init__(self, voxel_size: float, max_range: float, margin: tuple[float, float] = (0.0, 0.0)):
@@ -32,7 +32,7 @@ class Seen:
         self._marks = BlockPool(np.uint8)
 
     def add(self, depth_m: NDArray[np.floating], camera: PinholeCamera, T_world_camera: Transform) -> None:
-        """Take in depths (height, width) in metres along the optical axis: 0 or NaN tells nothing, inf sees no end."""
+        """Add depths (height, width) in metres along the optical axis: 0 or NaN is no value, inf has no end."""
         depth = np.nan_to_num(np.asarray(depth_m, float), nan=0.0, posinf=np.inf)
         ends = self._ends(depth, camera, T_world_camera)
         through = self._through(depth, Viewpoint(camera, T_world_camera))
@@ -40,7 +40,7 @@ class Seen:
         self._mark(through[position(through, ends) < 0], FREE)
 
     def cells(self, wanted: int) -> Keys:
-        """Return the cells, ascending, whose marks are just `wanted`, of FREE, END and FREE | END."""
+        """Return the cells, ascending, whose marks equal `wanted`: FREE, END or FREE | END."""
         n = len(self._marks)
         block, column = np.nonzero(self._marks.values[:n] == wanted)
         low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
@@ -54,7 +54,7 @@ class Seen:
         return np.unique(keys(np.floor(transform_points(T, points) / self.voxel_size)))
 
     def _through(self, depth: NDArray[np.float64], viewpoint: Viewpoint) -> Keys:
-        """Return the cells, ascending, whose centre lies well before the end of the ray through its pixel."""
+        """Return the cells, ascending, whose centre is well before the end of the ray through its pixel."""
         camera, T = viewpoint.camera, viewpoint.T_world_camera
         cells_off, share = self.margin
         clear = depth * (1 - share) - cells_off * self.voxel_size

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated flights that trust what the map says over MAVLink."""
+"""Simulated flights that rely on the map's MAVLink messages."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The air of a simulated scene, and how much of it a map knows to be free."""
+"""The air of a simulated scene, and the share of it that a map knows to be free."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from stereovox.simulate.scene import Scene
 
 
 class Air:
-    """The cells of a scene that touch nothing, have something above and below them, and are connected with a place.
+    """The cells of a scene that touch nothing, have surfaces above and below, and are connected with a place.
 
-    Connected means by faces: rooms behind closed doors and the insides of solids do not count, nor does what lies
-    outdoors, without a ceiling, beyond an open window. Exact, by the triangles of the scene.
+    Connected means by faces: rooms behind closed doors and the insides of solids do not count, nor does the outdoors,
+    without a ceiling, beyond an open window. Exact, by the triangles of the scene.
 
     Args:
         scene: The scene.
-        cell: Size of the cells in metres, those of the map.
+        cell: Size of the map's cells in metres.
         place: (3,) metres, in the air.
 
     Attributes:
@@ -51,13 +51,13 @@ class Air:
         self.centres = (np.argwhere(self._air) + first + 0.5) * cell
 
     def known(self, voxel_map: VoxelMap) -> float:
-        """Return the share of the air that the map knows to be free."""
+        """Return the share of the air known to be free in the map."""
         return float((voxel_map.state(self.centres) == State.FREE).mean())
 
     def room(self, place: NDArray[np.float64], half_height: float) -> tuple[float, float]:
-        """Return the horizontal metres about a place that are air, and the most there are anywhere at its height.
+        """Return the horizontal radius of air around a place in metres, and the largest anywhere at its height.
 
-        place: (3,) metres. half_height: metres above and below it that must be air, too. To half a cell.
+        place: (3,) metres. half_height: metres above and below it that must also be air. Accurate to half a cell.
         """
         from scipy.ndimage import distance_transform_edt
 

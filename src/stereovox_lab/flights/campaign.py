@@ -21,12 +21,12 @@ from stereovox_lab.flights.flight import World
 MISSIONS: dict[str, Callable[[], Mission]] = {"frontiers": Frontiers, "middle": MiddleOfRoom}
 SCENES = ("sim:hall?plan={seed}",)
 IMAGE_WIDTH = 212
-"""Pixels, where a scene does not say."""
+"""Default image width in pixels."""
 
 
 @dataclass(frozen=True)
 class _Flight:
-    """What one process needs to know. save: where the map goes; None: nowhere."""
+    """The inputs of one process. save: path of the map; None: not saved."""
 
     scene: str
     seed: int
@@ -46,27 +46,27 @@ def explore(
     progress: Callable[[int, int, str], None] | None = None,
     so_far: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    """Fly a simulated quadrotor by its own map, which nobody steers, and tell what came of it.
+    """Fly a simulated quadrotor autonomously by its own map, and return the results.
 
     Args:
-        scenes: Simulations (`sim:...`); `{seed}` in them stands for the flight's seed. Images are 212 pixels wide
-            where a scene does not say `image_width`.
+        scenes: Simulations (`sim:...`); `{seed}` in them is replaced by the flight's seed. Images are 212 pixels wide
+            unless a scene gives `image_width`.
         mission: `frontiers`: explore until no frontier can be reached; `middle`: find the middle of the room and look
             round there (Chien 2020, 5.1).
         seeds: Of start, heading and noise; each is flown in each scene.
-        cruise: How it is flown; its `scene` does not count. By default `Cruise()`.
+        cruise: Flight settings; its `scene` is ignored. By default `Cruise()`.
         jobs: Processes; with more than one, call this under `if __name__ == "__main__":`. The result is the same.
         maps: Folder for the map of each scene's first flight; None: maps are not kept.
-        progress: Called with flights done, all flights, and what is flown.
+        progress: Called with flights done, all flights, and the current one.
         so_far: Called with the result after each flight.
 
     Returns:
-        `mission`, `settings` of the flights, `maps` (paths of what was written), `scenes`: the summary of each, and
+        `mission`, `settings` of the flights, `maps` (paths written), `scenes`: the summary of each, and
         `flights`: `Explored.as_dict()` of each with its `scene`. Plain types for JSON.
 
     Raises:
-        StereovoxError: An unknown mission, no seed, or values that make no sense.
-        SourceError: An unknown scene, or one in which there is no room to start.
+        StereovoxError: An unknown mission, no seed, or invalid values.
+        SourceError: An unknown scene, or one without room to start.
     """
     cruise, numbers = cruise or Cruise(), [int(seed) for seed in seeds]
     _check(scenes, mission, numbers, cruise, jobs)
@@ -96,10 +96,10 @@ def explore(
 
 
 def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return what all flights in one scene come to; medians are over flights.
+    """Return the summary of all flights in one scene; medians are over flights.
 
-    `seconds_to_share`: median seconds until a flight knew that share of the air, None if fewer than half came to it.
-    `left`: the frontiers that are left in all of them together, by why they were not gone to.
+    `seconds_to_share`: median seconds until a flight knew that share of the air, None if fewer than half reached it.
+    `left`: remaining frontiers of all flights together, by the reason they were not visited.
     """
     mine = [row for row in rows if row["scene"] == scene]
     last = [row["coverage"][-1][1] for row in mine]
@@ -159,7 +159,7 @@ def _map_of(folder: Path | None, number: int) -> Path | None:
 
 
 def _narrow(scene: str) -> str:
-    """Return the scene with narrow images, unless it or its design says how wide they are."""
+    """Return the scene with narrow images, unless it or its design gives their width."""
     name, _, options = scene.partition("?")
     if name == "sim:hall" or "image_width=" in options:
         return scene

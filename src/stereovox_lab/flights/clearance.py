@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points are from the surfaces of a simulated scene."""
+"""Distances of points from the surfaces of a simulated scene."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Clearance:
         return min(farthest, float(self._distances(point, near).min()))
 
     def _outside(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far a point is outside the box round each triangle (M, 3)."""
+        """Return the distance of a point outside the box around each triangle (M, 3)."""
         return np.maximum(np.maximum(self._low - point, point - self._high), 0)
 
     def _distances(self, point: NDArray[np.float64], which: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the distances (n,): to the plane where the foot lies within the triangle, else to its nearest side."""
+        """Return the distances (n,): to the plane if the foot is within the triangle, else to its nearest side."""
         normal = self._normal[which]
         within = np.ones(len(which), bool)
         to_sides = np.full(len(which), np.inf)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Missions of a simulated quadrotor that nobody steers: find the middle of a room and look round, and explore a hall.
+"""Autonomous missions of a simulated quadrotor: find the middle of a room and look around, and explore a hall.
 
-Each goal is reached by a way that is known to be free, and the vehicle looks where it flies; while it flies, the way
-ahead is checked against the newest map, and it stops and plans again if that is not free any more.
+Each goal is reached by a known free path, and the vehicle faces where it flies; during flight, the path ahead is
+checked against the newest map, and if it is no longer free the vehicle stops and replans.
 """
 
 from __future__ import annotations
@@ -26,38 +26,38 @@ from stereovox_lab.flights.flight import STEP_S, World
 from stereovox_lab.flights.quadrotor import Airframe, Quadrotor
 
 LOOK_S = 8.0
-"""Seconds of a turn on the spot."""
+"""Seconds of a turn in place."""
 ARRIVED, AHEAD = 0.15, 0.5
-"""Metres from the end of a way at which it is done, and from the vehicle to where on its way it steers."""
+"""Metres from the end of a path at which it counts as flown, and look-ahead distance along the path."""
 CHECK_M, CHECK_S = 1.0, 0.2
-"""Metres of the way that are checked, and how often."""
+"""Metres of the path that are checked, and seconds between checks."""
 FACING = 0.5
-"""It flies once it looks along its way to within so many radians."""
+"""It flies once it faces along its path within this many radians."""
 NEAR_M, SHORT_M = 0.5, 2.0
-"""A way leads to within NEAR_M of where a frontier is seen from; where none does, one that ends SHORT_M short brings
-the vehicle nearer, and it looks from there."""
+"""A path leads to within NEAR_M of a frontier's viewpoint; if none does, one that ends SHORT_M short brings the vehicle
+nearer, and it looks from there."""
 SEEN_AGAIN, TRIES = 0.6, 3
-"""A look at what is within so many metres of what was looked at before, from within as many metres of that place,
-shows nothing new. A way there that had to be left so often is not tried again."""
+"""A look from within this many metres of an earlier place at a target within as many metres of the earlier one shows
+nothing new. A path there that had to be abandoned this often is not tried again."""
 ROUND_M, ROUNDS = 1.5, 3
-"""Metres between places from which it looks all round, and how many looks in a row may show no frontier to go to."""
+"""Metres between places from which it looks around, and most such looks in a row without a reachable frontier."""
 UNSEEN, NO_WAY, LOOKED_AT = "seen from nowhere", "no way to it", "looked at already"
-"""Why a frontier is left."""
+"""Reasons why a frontier remains."""
 
 
 @dataclass(frozen=True)
 class Cruise:
-    """How a mission is flown.
+    """Settings of a mission.
 
     Attributes:
-        scene: Simulation; `{seed}` in it stands for the flight's seed.
+        scene: Simulation; `{seed}` in it is replaced by the flight's seed.
         seconds: Longest time of a mission.
-        speed: m/s along ways.
+        speed: m/s along paths.
         turn: Radians a second.
         voxel_size: Of the map, metres.
         camera_hz: Images a second.
-        delay_s: From the image to the map.
-        margin: Metres between the propellers and what is not known to be free.
+        delay_s: Delay from the image to the map.
+        margin: Metres between the propellers and cells not known to be free.
         half_height: Metres above and below the vehicle that must be free.
         own_radius: As in `SectorRules`.
         airframe: The quadrotor.
@@ -77,26 +77,26 @@ class Cruise:
 
     @property
     def radius(self) -> float:
-        """Radius of the ball whose way must be free."""
+        """Radius of the ball whose path must be free."""
         return self.airframe.radius + self.margin
 
 
 class Mission(Protocol):
-    """What chooses goals.
+    """Chooses goals.
 
     Attributes:
-        left: Once it is done: how many goals are left that it cannot reach, by why.
+        left: When done: number of remaining goals that it cannot reach, by reason.
     """
 
     left: dict[str, int]
 
     def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return a way (N, 3) and the place (3,) to look at from its end, NaN to look all round; None: it is done."""
+        """Return a path (N, 3) and the place (3,) to look at from its end, NaN to look all around; None when done."""
         ...
 
 
 class MiddleOfRoom:
-    """Find the middle of a room and look round there, until it is where it was thought to be."""
+    """Find the middle of a room and look around there, until its position no longer changes."""
 
     def __init__(self, looks: int = 3):
         self._looks_left, self._last = looks, np.full(3, inf)
@@ -104,7 +104,7 @@ class MiddleOfRoom:
         self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the way to the middle as it is known by now."""
+        """Return the path to the middle as currently known."""
         found = ways.middle()
         if found is None or not self._looks_left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
             return None
@@ -114,8 +114,8 @@ class MiddleOfRoom:
 
 
 class Frontiers:
-    """Explore: go to the frontier that is nearest along the way and look at it; where none can be reached, look all
-    round from as near to one as the way leads, the largest first, until that was in vain ROUNDS times."""
+    """Explore: go to the frontier nearest along the path and look at it; if none is reachable, look all around from as
+    near as possible to one, the largest first, until that was in vain ROUNDS times."""
 
     def __init__(self, smallest: int = 15, band: float = 0.6):
         self._smallest, self._band = smallest, band
@@ -125,8 +125,8 @@ class Frontiers:
         self.left: dict[str, int] = {}
 
     def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the way to where the nearest frontier is seen from, or to where it looks all round."""
-        self._rounds = self._rounds or [ways.start]  # where it began it turned once
+        """Return the path to the nearest frontier's viewpoint, or to a place to look all around."""
+        self._rounds = self._rounds or [ways.start]  # it turned once at the start
         height = ways.start[2]
         found = frontiers(
             voxel_map,
@@ -136,7 +136,7 @@ class Frontiers:
             start=ways.start,
             radius=0.2,
         )
-        if self._looks:  # the last was looked at only where it came to the end of the way
+        if self._looks:  # the last was seen only if it reached the end of the path
             place, end, _ = self._looks[-1]
             self._looks[-1] = place, end, bool(np.linalg.norm((ways.start - end)[:2]) < 2 * ARRIVED)
         best = self._nearest(found, ways, NEAR_M) or self._nearest(found, ways, SHORT_M)
@@ -150,7 +150,7 @@ class Frontiers:
         return best
 
     def _is_done(self, place: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
-        """Return whether a frontier was looked at from about there, or the way there had to be left TRIES times."""
+        """Return whether a frontier was seen from about there, or the path there was abandoned TRIES times."""
         same = [
             looked
             for at, from_, looked in self._looks
@@ -161,7 +161,7 @@ class Frontiers:
     def _nearest(
         self, found: list[Frontier], ways: LevelPlanner, near: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the shortest way to `near` metres from where one of the frontiers is seen from, and its middle."""
+        """Return the shortest path to within `near` metres of a frontier's viewpoint, and the frontier's middle."""
         best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         for one in found:
             way = None if one.look_from is None else ways.path_to(one.look_from, near)
@@ -174,7 +174,7 @@ class Frontiers:
     def _round(
         self, found: list[Frontier], ways: LevelPlanner
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the way to look all round from as near to one of the frontiers as it can come, the largest first."""
+        """Return the path to a look around from as near as possible to a frontier, the largest first."""
         for one in found:
             way = ways.path_to(one.centroid, inf)
             if way is not None and all(np.linalg.norm((way[-1] - place)[:2]) > ROUND_M for place in self._rounds):
@@ -183,7 +183,7 @@ class Frontiers:
         return None
 
     def _why_left(self, found: list[Frontier], ways: LevelPlanner) -> dict[str, int]:
-        """Count the frontiers that are left, by why none of them is a goal."""
+        """Count the remaining frontiers, by the reason they are not goals."""
         why = [
             UNSEEN if one.look_from is None else NO_WAY if ways.path_to(one.look_from, SHORT_M) is None else LOOKED_AT
             for one in found
@@ -193,22 +193,22 @@ class Frontiers:
 
 @dataclass(frozen=True)
 class Explored:
-    """What became of a mission.
+    """The result of a mission.
 
     Attributes:
-        seed: Of hall, start and noise.
-        collided_s: Second at which a propeller touched something; None: it did not.
-        seconds: How long it flew.
+        seed: Seed of hall, start and noise.
+        collided_s: Time in seconds of a propeller's contact; None: no contact.
+        seconds: Flight time.
         done: Whether the mission ended by itself.
-        metres: How far it flew.
-        goals: How many ways it flew, or began to.
+        metres: Distance flown.
+        goals: Number of paths flown, or begun.
         clearance_m: Least distance between its middle and a surface.
-        coverage: (seconds, share of the scene's air that is known to be free) every ten seconds.
-        place: (3,) metres, where it ended.
-        path: (3,) metres every second, where it flew.
-        room_m: Horizontal metres about the place where it ended that touch nothing, `half_height` above and below.
-        most_room_m: The most of that there is anywhere in the scene's air at its height.
-        left: How many frontiers are left, by why it does not go there; empty if it did not end by itself.
+        coverage: (seconds, share of the scene's air known to be free) every ten seconds.
+        place: (3,) metres, its last position.
+        path: (3,) metres every second.
+        room_m: Horizontal clearance at its last position in metres, `half_height` above and below.
+        most_room_m: The largest such clearance in the scene's air at its height.
+        left: Number of remaining frontiers, by reason; empty if the mission did not end by itself.
     """
 
     seed: int
@@ -236,13 +236,13 @@ def fly(
     """Fly a mission.
 
     Args:
-        seed: Of hall, start and noise.
-        mission: What chooses goals.
-        cruise: How it is flown; by default `Cruise()`.
-        world: The scene, if it is made already.
+        seed: Seed of hall, start and noise.
+        mission: Chooses goals.
+        cruise: Settings; by default `Cruise()`.
+        world: The scene, if already built.
 
     Returns:
-        What became of it, and the map that was made.
+        The result, and the map.
     """
     cruise = cruise or Cruise()
     flown = _Mission(seed, mission, cruise, world or World(cruise.scene.format(seed=seed)))
@@ -301,7 +301,7 @@ class _Mission:
         return Explored(self._seed, collided, now, done, *course)
 
     def _see(self, now: float) -> None:
-        """Take an image where one is due, and put those into the map that were taken long enough ago."""
+        """Take an image if one is due, and add images to the map whose delay has passed."""
         if now >= self._images / self._cruise.camera_hz:
             self._under_way.append((now, self._quad.T_world_body))
             self._images += 1
@@ -311,7 +311,7 @@ class _Mission:
             self._mapper.add(self._world.camera.frame_from(T, number, round(1e9 * taken)))
 
     def _choose(self) -> bool:
-        """Choose the next way; return whether there is one."""
+        """Choose the next path; return whether there is one."""
         cruise = self._cruise
         here = np.array([*self._quad.position[:2], self._height])
         ways = LevelPlanner(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
@@ -322,7 +322,7 @@ class _Mission:
         return True
 
     def _steer(self, now: float) -> None:
-        """Fly one step along the way, or turn."""
+        """Fly one step along the path, or turn."""
         quad, cruise = self._quad, self._cruise
         if self._way is None:
             rate = self._turning()
@@ -342,7 +342,7 @@ class _Mission:
         quad.step(flown, self._height, rate, STEP_S)
 
     def _turning(self) -> float:
-        """Return the rate of a turn all round, or towards a place that is held for a second."""
+        """Return the rate of a full turn, or of a turn towards a place that is then faced for a second."""
         if np.isnan(self._look_at).any():
             rate = 2 * np.pi / LOOK_S
             self._look_left -= rate * STEP_S
@@ -353,7 +353,7 @@ class _Mission:
         return float(np.clip(2 * off, -self._cruise.turn, self._cruise.turn))
 
     def _free_ahead(self, now: float, along: float) -> bool:
-        """Return whether the next metre of the way is free by the newest map, but for the vehicle's own place."""
+        """Return whether the next metre of the path is free in the newest map, except the vehicle's own place."""
         if self._way is None or now - self._checked < CHECK_S:
             return True
         self._checked, cruise = now, self._cruise
@@ -369,7 +369,7 @@ def _length(way: NDArray[np.float64]) -> float:
 
 
 def _passed(way: NDArray[np.float64], place: NDArray[np.float64]) -> float:
-    """Return how far along a way the point of it is that is nearest to a place."""
+    """Return the distance along a path of its point nearest to a place."""
     a, b = way[:-1, :2], way[1:, :2]
     share = ((place[:2] - a) * (b - a)).sum(axis=1) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-12)
     share = np.clip(share, 0, 1)

@@ -21,34 +21,34 @@ from stereovox_lab.flights.px4 import CollisionPrevention, Parameters
 from stereovox_lab.flights.quadrotor import Airframe, Quadrotor
 
 STEP_S = 0.02
-"""Of the simulation: the autopilot's controller runs at 50 Hz."""
+"""Time step of the simulation: the autopilot's controller runs at 50 Hz."""
 HEIGHTS = (0.9, 1.6)
-"""Metres between which each flight's height is drawn."""
+"""Range in metres from which each flight's height is drawn."""
 START_ROOM = 0.75
-"""Metres about the start that are free: who takes off sees to that."""
+"""Metres around the start that are free: a pilot ensures that."""
 TURN_S = 8.0
-"""Seconds of the turn on the spot with which a flight begins."""
+"""Seconds of the turn in place at the start of a flight."""
 CEILING = 4.0
-"""A start has something above and below it within so many metres."""
+"""A start has surfaces above and below it within this many metres."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What a flight is flown with.
+    """Settings of a flight.
 
     Attributes:
-        scene: Simulation, with the camera's noise; `{seed}` in it stands for the flight's seed.
-        seconds: Length of the flight, after the turn on the spot.
-        prevention: Whether the autopilot prevents collisions; else the sticks are obeyed.
-        speed: Largest speed that the sticks ask for, m/s.
+        scene: Simulation, with the camera's noise; `{seed}` in it is replaced by the flight's seed.
+        seconds: Length of the flight, after the turn in place.
+        prevention: Whether the autopilot prevents collisions; else it obeys the sticks.
+        speed: Largest speed commanded by the sticks, m/s.
         voxel_size: Of the map, metres.
         camera_hz: Images a second.
-        delay_s: From the image to the map.
+        delay_s: Delay from the image to the map.
         rate_hz: OBSTACLE_DISTANCE messages a second.
-        max_age_s: Seconds since the last frame that the map took in after which none is sent.
-        pose_sigma: Standard deviations of the error of each pose on its own: metres, radians.
-        rules: Of the sectors.
-        parameters: The autopilot's.
+        max_age_s: Age in seconds of the last frame in the map above which none is sent.
+        pose_sigma: Standard deviations of each pose's independent error: metres, radians.
+        rules: Rules of the sectors.
+        parameters: Parameters of the autopilot.
         airframe: The quadrotor.
     """
 
@@ -69,18 +69,18 @@ class Setup:
 
 @dataclass(frozen=True)
 class Flight:
-    """What became of a flight.
+    """The result of a flight.
 
     Attributes:
-        seed: Of start, sticks and noise.
-        collided_s: Second at which a propeller touched something; None: it did not.
+        seed: Seed of start, sticks and noise.
+        collided_s: Time in seconds of a propeller's contact; None: no contact.
         seconds: Length of the flight, up to the collision.
-        metres: How far it flew.
-        asked_m: How far the sticks asked it to fly.
+        metres: Distance flown.
+        asked_m: Distance commanded by the sticks.
         clearance_m: Least distance between its middle and a surface.
         top_speed: m/s.
-        refused: Frames that the map did not take.
-        frames: Frames that it did.
+        refused: Number of refused frames.
+        frames: Number of frames in the map.
     """
 
     seed: int
@@ -99,7 +99,7 @@ class Flight:
 
 
 class World:
-    """A scene, made once for all flights in it."""
+    """A scene, built once for all its flights."""
 
     def __init__(self, scene: str):
         self.camera = Simulation(scene)
@@ -108,7 +108,7 @@ class World:
         self._low, self._high = corners.min(axis=0), corners.max(axis=0)
 
     def start(self, random: np.random.Generator) -> NDArray[np.float64]:
-        """Return a place (3,) with room about it; raises SourceError if a scene has none."""
+        """Return a place (3,) with room around it; raises SourceError if a scene has none."""
         for _ in range(10_000):
             place = random.uniform(self._low, self._high)
             place[2] = random.uniform(*HEIGHTS)
@@ -117,7 +117,7 @@ class World:
         raise SourceError(f"{self.camera.name} has no place with {START_ROOM} m of room; choose another scene")
 
     def _inside(self, place: NDArray[np.float64]) -> bool:
-        """Return whether there is a floor and a ceiling, seen from the right side, and walls all round."""
+        """Return whether there is a floor and a ceiling, seen from the right side, and walls all around."""
         angles = np.radians(np.arange(0, 360, 15))
         around = np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
         directions = np.vstack([[[0, 0, -1.0], [0, 0, 1.0]], around]).astype(np.float32)
@@ -127,14 +127,14 @@ class World:
 
 
 class Sticks:
-    """What a pilot's hands do: a new wish every second or two, mostly ahead, now and then any way."""
+    """A pilot's stick inputs: a new command every second or two, mostly ahead, sometimes in any direction."""
 
     def __init__(self, random: np.random.Generator, speed: float):
         self._random, self._speed, self._until = random, speed, 0.0
         self.forward = self.left = self.yaw_rate = 0.0
 
     def at(self, seconds: float, yaw: float) -> tuple[NDArray[np.float64], float]:
-        """Return the velocity (2,) in the world that is asked for, and the rate of yaw."""
+        """Return the commanded velocity (2,) in the world, and yaw rate."""
         if seconds < TURN_S:
             return np.zeros(2), 2 * np.pi / TURN_S
         if seconds >= self._until:
@@ -152,12 +152,12 @@ def fly(seed: int, setup: Setup | None = None, world: World | None = None) -> Fl
     """Fly once.
 
     Args:
-        seed: Of start, sticks and noise; the same with and without prevention.
-        setup: What it is flown with; by default `Setup()`.
-        world: The scene, if it is made already.
+        seed: Seed of start, sticks and noise; the same with and without prevention.
+        setup: Settings; by default `Setup()`.
+        world: The scene, if already built.
 
     Returns:
-        What became of it.
+        The result.
     """
     setup = setup or Setup()
     world = world or World(setup.scene.format(seed=seed))
@@ -205,7 +205,7 @@ class _Loop:
         )
 
     def _map(self, now: float) -> None:
-        """Put images into the map that were taken long enough ago."""
+        """Add images to the map whose delay has passed."""
         while self._under_way and now >= self._under_way[0][0] + self._setup.delay_s:
             taken, _, T = self._under_way.popleft()
             number = self._frames + self._refused
@@ -225,14 +225,14 @@ class _Loop:
         return wrong
 
     def _tell(self, now: float) -> None:
-        """Send sectors as `ObstacleSender` does: of the pose of the last frame, and none once that is too old."""
+        """Send sectors as `ObstacleSender` does: for the pose of the last frame, and none once that is too old."""
         if self._pose is not None and now - self._accepted <= self._setup.max_age_s:
             rules = self._setup.rules
             cm = obstacle_sectors(self._mapper.map, self._pose, rules).centimetres(rules)
             self._autopilot.receive(cm, rules.max_cm, now)
 
     def _move(self, now: float) -> float | None:
-        """Fly one step; return when something was touched."""
+        """Fly one step; return the time of a contact, if any."""
         quad = self._quad
         wanted, yaw_rate = self._sticks.at(now, quad.yaw)
         allowed = (

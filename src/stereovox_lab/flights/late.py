@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A flight whose images and poses come late, by a clock of its own: is what the autopilot hears true when it is sent?
+"""A flight with late images and poses and its own clock: are the autopilot's messages true when sent?
 
-Pillars and walls stand upright, so that the exact distance in each direction is known at any time. Nothing waits: the
-clock is simulated, and images are small.
+Pillars and walls are vertical, so that the exact distance in each direction is always known. Nothing waits: the clock
+is simulated, and images are small.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from stereovox.sources.poses.live_poses import LivePoses
 CAMERA = PinholeCamera.from_field_of_view(48, 36, 90.0)
 HEIGHT_M, CEILING_M = 1.2, 2.4
 IMAGE_S, POSE_S, MESSAGE_S, WAIT_S = 1 / 10, 1 / 20, 1 / 8, 0.3
-"""Between two images, poses and messages; and how long an image waits for its pose."""
+"""Seconds between images, poses and messages; and how long an image waits for its pose."""
 LONGEST_S, SHORT_S = 5.0, 0.6
-"""Longest delay of all, and of every second one: near the limit some messages are sent and others not."""
+"""Longest delay, and the longest for every second flight: near the limit only some messages are sent."""
 OFF_M, MOTION_S = 0.3, 0.1
-"""How far a distance may be off: this, and the body's own motion in this time."""
+"""Tolerance of a distance: this, plus the body's own motion in this time."""
 BLUR_DEG = 5.0
-"""How far beyond its edges a sector may have looked, besides its overlap and the body's own turning: a cell's width."""
+"""How far a sector may reach beyond its edges, besides its overlap and the body's turning: a cell's width."""
 KINDS = ("none", "constant", "growing", "jumping", "start")
-"""Of delays: none; the same for all; growing from none; a jump and back; late from the start, then in time."""
+"""Kinds of delays: none; constant; growing from none; a jump and back; late from the start, then in time."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Delay:
     to_s: float = 0.0
 
     def at(self, time_s: float) -> float:
-        """Return the seconds by which what happens at a time is late."""
+        """Return the delay in seconds of an event at a time."""
         within = self.from_s <= time_s < self.to_s
         if self.kind == "growing":
             return self.seconds * min(max(time_s - self.from_s, 0) / (self.to_s - self.from_s), 1)
@@ -64,14 +64,14 @@ class Delay:
 
 @dataclass(frozen=True)
 class LateSetup:
-    """What a flight is flown with.
+    """Settings of a flight.
 
     Attributes:
         seconds: Its length.
         images: Delay of each camera's images: one looks ahead, a second one back.
-        poses: Delay of the poses of the body; None: poses come with the images alone.
-        clock: `host`: stamps are by a clock that is known; `device`: by one that nothing is known of.
-        arrival: Ages count from arrival and obstacles are those round the image's pose, as before stamps counted.
+        poses: Delay of the poses of the body; None: poses arrive only with the images.
+        clock: `host`: stamps are by a known clock; `device`: by an unknown one.
+        arrival: Ages count from arrival and obstacles are around the image's pose, as before stamps counted.
     """
 
     seconds: float = 5.0
@@ -83,11 +83,11 @@ class LateSetup:
 
 @dataclass
 class LateFlight:
-    """What became of a flight: messages, distances in them that are none of UNKNOWN, and those that are too far off.
+    """The result of a flight: messages, their distances other than UNKNOWN, and those that are too far off.
 
     Attributes:
-        worst_m: By how much the worst distance was off, beyond what the body moves in MOTION_S.
-        why: How often nothing was sent, by reason.
+        worst_m: Largest error of a distance, beyond the body's motion in MOTION_S.
+        why: Number of times nothing was sent, by reason.
     """
 
     messages: int = 0
@@ -112,7 +112,7 @@ def setup_of(seed: int) -> LateSetup:
     posed = draw.random() < 0.8
     poses = delay(KINDS if draw.random() < 0.5 else ("none",)) if posed else None
     clock = "host" if draw.random() < 0.6 else "device"
-    if clock == "device":  # of an unknown clock a delay that never changes cannot be known: something came in time once
+    if clock == "device":  # a constant delay of an unknown clock is undetectable: something must once arrive in time
         poses = poses and (Delay() if poses.kind in ("constant", "start") else poses)
         if poses is None:
             images = tuple(Delay() if one.kind in ("constant", "start") else one for one in images)
@@ -120,7 +120,7 @@ def setup_of(seed: int) -> LateSetup:
 
 
 class Place:
-    """A hall with pillars, and the way of a body through it."""
+    """A hall with pillars, and the path of a body through it."""
 
     def __init__(self, seed: int):
         draw = np.random.default_rng([seed, 8])
@@ -132,7 +132,7 @@ class Place:
         self.boxes = self._pillars(draw)
 
     def _pillars(self, draw: np.random.Generator) -> NDArray[np.float64]:
-        """Return low and high corners (M, 2, 2) of pillars that the body's way does not come near."""
+        """Return low and high corners (M, 2, 2) of pillars away from the body's path."""
         found: list[NDArray[np.float64]] = []
         while len(found) < 4:
             size, middle = draw.uniform(0.2, 1.0, 2), draw.uniform(-self.half, self.half)
@@ -158,7 +158,7 @@ class Place:
         return np.array([[s, 0, c, x], [-c, 0, s, y], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1.0]])
 
     def hits(self, place: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (N,) it is from a place (2,) along horizontal directions (N, 2), in their lengths."""
+        """Return the distances (N,) from a place (2,) along horizontal directions (N, 2), in their lengths."""
         x, y = (1 / np.where(np.abs(axis) < 1e-12, 1e-12, axis) for axis in directions.T)
         found = np.minimum(np.abs(x) * self.half[0] - place[0] * x, np.abs(y) * self.half[1] - place[1] * y)
         for low, high in self.boxes - place:
@@ -203,7 +203,7 @@ class LateLoop:
         self._max_m, self._half_deg = rules.max_distance, INCREMENT_DEG / 2 + rules.overlap_deg
 
     def run(self) -> LateFlight:
-        """Fly, and return what became of it."""
+        """Fly, and return the result."""
         setup = self.setup
         for k, delay in enumerate(setup.images):
             self._plan(delay, IMAGE_S, self._image, list(self._mounts)[k])
@@ -217,7 +217,7 @@ class LateLoop:
         return self.flight
 
     def _plan(self, delay: Delay, step_s: float, act: Callable[..., None], *given: Any) -> None:
-        """Let what happens every `step_s` arrive, each thing after the ones before it."""
+        """Schedule the arrival of events every `step_s`, each after the earlier ones."""
         last = 0.0
         for k in range(int(self.setup.seconds / step_s)):
             last = max(last + 1e-6, k * step_s + delay.at(k * step_s) + 0.005)
@@ -239,7 +239,7 @@ class LateLoop:
             self.sender.pose(self._stamp_ns(event_s), T)
 
     def _image(self, event_s: float, name: str, since_s: float | None = None) -> None:
-        """Map an image once the pose of its time is there, as live runs do."""
+        """Map an image once the pose of its time has arrived, as live runs do."""
         stamp_ns, T_true = self._stamp_ns(event_s), self.place.pose(event_s)
         since_s = self._now_s if since_s is None else since_s
         T_world_body = T_true
@@ -281,7 +281,7 @@ class LateLoop:
         return True
 
     def _nearest(self, here: NDArray[np.float64], yaw: float, half_deg: float) -> NDArray[np.float64]:
-        """Return the true distance (72,) of what is nearest within so many degrees of each sector's middle."""
+        """Return the true nearest distance (72,) within `half_deg` degrees of each sector's middle."""
         step = 0.5
         angles = yaw - np.radians(np.arange(0, 360, step))
         away = np.minimum(self.place.hits(here, np.column_stack([np.cos(angles), np.sin(angles)])), self._max_m)
@@ -293,10 +293,10 @@ def fly_late(seed: int, setup: LateSetup | None = None) -> LateFlight:
     """Fly once.
 
     Args:
-        seed: Of the hall, the way, noise, and of delays and clocks where `setup` does not say them.
+        seed: Seed of the hall, the path, noise, and of delays and clocks unless `setup` gives them.
         setup: Delays and clocks.
 
     Returns:
-        What became of it.
+        The result.
     """
     return LateLoop(seed, setup).run()

@@ -2,7 +2,7 @@
 """PX4's collision prevention as its documents and source describe it, for simulated flights.
 
 https://docs.px4.io/v1.14/en/computer_vision/collision_prevention.html, "Algorithm Description": OBSTACLE_DISTANCE is
-kept in 36 sectors; speed along the stick is limited such that the vehicle stops `CP_DIST` before what is in any sector
+kept in 36 sectors; speed along the stick is limited so that the vehicle stops `CP_DIST` before obstacles in any sector
 of that hemisphere, `CP_DELAY` and the age of the data included; a sector without data is not flown into
 (`CP_GO_NO_DATA` = 0); without any message for 0.5 s it does not move. The direction may be turned by `CP_GUIDE_ANG`.
 Formulas: v1.14, src/lib/collision_prevention/CollisionPrevention.cpp, and `computeMaxSpeedFromDistance` of
@@ -24,7 +24,7 @@ TIMEOUT_S = 0.5
 
 @dataclass(frozen=True)
 class Parameters:
-    """PX4's parameters, with its defaults but for `cp_dist`, which is off by default.
+    """PX4's parameters, with its defaults except `cp_dist`, which is off by default.
 
     Attributes:
         cp_dist: CP_DIST, metres to keep from obstacles, measured from the sensor, here the vehicle's middle.
@@ -44,7 +44,7 @@ class Parameters:
 
 
 class CollisionPrevention:
-    """The sectors that PX4 keeps, and what it makes of a velocity. Bearings run clockwise from the vehicle's front."""
+    """PX4's sectors, and its limit on a velocity. Bearings run clockwise from the vehicle's front."""
 
     def __init__(self, parameters: Parameters | None = None):
         self.parameters = parameters or Parameters()
@@ -52,9 +52,9 @@ class CollisionPrevention:
         self._max_cm, self._last = 0, -inf
 
     def receive(self, distances_cm: NDArray[np.uint16], max_cm: int, now: float) -> None:
-        """Take OBSTACLE_DISTANCE (72,) of 5 degrees in MAV_FRAME_BODY_FRD with `min_distance` 0, at `now` seconds.
+        """Receive OBSTACLE_DISTANCE (72,) of 5 degrees in MAV_FRAME_BODY_FRD with `min_distance` 0, at `now` seconds.
 
-        UINT16_MAX leaves a sector as it is. (`_addObstacleSensorData`; with one sensor `_enterData` takes all else.)
+        UINT16_MAX leaves a sector unchanged. (`_addObstacleSensorData`; with one sensor `_enterData` takes all else.)
         """
         self._last, self._max_cm = now, max_cm
         for i in range(BINS):
@@ -65,7 +65,7 @@ class CollisionPrevention:
     def limited(
         self, wanted: NDArray[np.float64], velocity: NDArray[np.float64], yaw: float, now: float
     ) -> NDArray[np.float64]:
-        """Return the velocity (2,) that is flown where the stick asks for `wanted` (2,), m/s in the world.
+        """Return the velocity (2,) flown when the stick commands `wanted` (2,), m/s in the world.
 
         velocity: (2,) of the vehicle now. yaw: radians to the left of the world's x.
         """
@@ -84,7 +84,7 @@ class CollisionPrevention:
         return towards * min(speed, self._fastest(towards, velocity, yaw, now))
 
     def _fastest(self, towards: NDArray[np.float64], velocity: NDArray[np.float64], yaw: float, now: float) -> float:
-        """Return the largest speed along a direction (2,) that all sectors allow."""
+        """Return the largest speed along a direction (2,) allowed by all sectors."""
         p, known = self.parameters, (self._cm != NO_DATA) & (self._cm > 0)
         directions = self._directions(yaw)
         ahead = directions @ towards
@@ -97,7 +97,7 @@ class CollisionPrevention:
         return float(np.min(most[counts] / ahead[counts], initial=inf))
 
     def _guided(self, towards: NDArray[np.float64], sector: int, yaw: float) -> tuple[NDArray[np.float64], int]:
-        """Return the direction and sector turned to where there is more room (`_adaptSetpointDirection`)."""
+        """Return the direction and sector turned towards more room (`_adaptSetpointDirection`)."""
         p, best, chosen = self.parameters, inf, sector
         reach = floor(p.cp_guide_ang / BIN_DEG)
         for i in range(sector - reach, sector + reach + 1):
@@ -115,6 +115,6 @@ class CollisionPrevention:
 
 
 def max_speed(jerk: float, accel: float, metres: float) -> float:
-    """Return the speed from which a vehicle can stop within so many metres, in m/s."""
+    """Return the speed in m/s from which a vehicle can stop within `metres`."""
     b = 4 * accel * accel / jerk
     return max(0.5 * (sqrt(b * b + 8 * accel * metres) - b), 0.0)

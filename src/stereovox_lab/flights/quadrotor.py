@@ -15,13 +15,13 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Airframe:
-    """How a quadrotor moves.
+    """Dynamics of a quadrotor.
 
     Attributes:
         radius: Metres from its middle to the end of its propellers.
         max_accel: Largest horizontal acceleration in m/s^2.
         velocity_s: Time constant of the velocity controller.
-        tilt_s: Time constant with which it reaches another tilt.
+        tilt_s: Time constant of the tilt.
         max_climb: Largest vertical speed in m/s.
     """
 
@@ -47,9 +47,9 @@ class Quadrotor:
         self.yaw, self._accel = yaw, np.zeros(2)
 
     def step(self, velocity: NDArray[np.float64], height: float, yaw_rate: float, seconds: float) -> None:
-        """Move on.
+        """Advance by one step.
 
-        velocity: (2,) m/s, x and y of the world, that it is to reach. height: metres that it is to keep. yaw_rate:
+        velocity: (2,) m/s, x and y of the world, the target. height: target in metres. yaw_rate:
         radians a second to the left. seconds: a few hundredths at most.
         """
         frame = self.frame
@@ -63,7 +63,7 @@ class Quadrotor:
 
     @property
     def T_world_body(self) -> Transform:  # noqa: N802 - its name elsewhere
-        """(4, 4) maps the body (optical axes: x right, y down, z forward) into the world; it leans where it pulls."""
+        """(4, 4) maps the body (optical: x right, y down, z forward) into the world; it leans as it accelerates."""
         up = np.array([*self._accel, GRAVITY])
         up /= np.linalg.norm(up)
         ahead = np.array([np.cos(self.yaw), np.sin(self.yaw), 0.0])

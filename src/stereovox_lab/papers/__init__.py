@@ -32,10 +32,10 @@ def reproduce(
 ) -> dict[str, Any]:
     """Reproduce the experiments of a paper and write `report.html` and `numbers.json` into folder `out`.
 
-    data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well;
-    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: a bag of your own, in
-    place of the simulated ones).
-    quick: fewer frames; enough to see that all works, not to quote. camera: of the simulated recordings (chien2020),
+    data: input besides simulation (chien2020: your own recording, also mapped;
+    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: your own bag,
+    instead of the simulated ones).
+    quick: fewer frames; enough to check that all works, not to quote. camera: of the simulated recordings (chien2020),
     as in their options: `simple`, `d435`, `kinect`. Returns the numbers, fit for JSON.
     Raises StereovoxError, one line, for an unknown paper or camera.
     """

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 Progress = Callable[[int, int, str], None]
-"""Called with steps done, steps in all, and what is being done."""
+"""Called with steps done, steps in all, and the current activity."""
 YES, NO, UNJUDGED = "\u2713 yes", "\u2717 no", "? cannot be judged"
 
 
@@ -16,7 +16,7 @@ YES, NO, UNJUDGED = "\u2713 yes", "\u2717 no", "? cannot be judged"
 class Claim:
     """One row of "does it hold?".
 
-    holds: None if nothing is claimed and the number is for comparison, or where the claim cannot be judged here:
+    holds: None if nothing is claimed and the number is for comparison, or if the claim cannot be judged here:
     `unjudged` then says why not.
     """
 
@@ -35,7 +35,7 @@ class Claim:
 
 
 def count(claims: Iterable[Claim]) -> tuple[int, int, int, int]:
-    """Return how many claims hold, do not hold, cannot be judged, and are mere figures."""
+    """Return the numbers of claims that hold, do not hold, cannot be judged, and are mere figures."""
     claims = list(claims)
     verdicts = [one.holds for one in claims]
     unjudged = sum(bool(one.unjudged) for one in claims)
@@ -44,9 +44,9 @@ def count(claims: Iterable[Claim]) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture (PNG), its place in the paper (`Fig 4.6`), what the paper says of its own, and what ours shows.
+    """A picture (PNG), its place in the paper (`Fig 4.6`), the paper's description of its picture, and ours.
 
-    A picture that the paper has none of has a heading as `place`, and `said` is empty.
+    A picture without a counterpart in the paper has a heading as `place`, and `said` is empty.
     """
 
     place: str
@@ -68,8 +68,8 @@ class Sheet:
 class Chapter:
     """One experiment of a report.
 
-    method: what was done, in a few sentences. remarks: what a reader must know to judge it, one paragraph each.
-    numbers: everything that was measured, fit for JSON.
+    method: a short description. remarks: background for judging it, one paragraph each.
+    numbers: all measurements, fit for JSON.
     """
 
     name: str
@@ -87,5 +87,5 @@ class Chapter:
 
 
 def percent(share: float) -> str:
-    """Return `94.3 %`, which no line break divides."""
+    """Return `94.3 %` with a no-break space."""
     return f"{100 * share:.1f}\u00a0%"

@@ -38,13 +38,13 @@ NOISE = {
     "neighbouring pixels, with holes, flying pixels and mismatches, and without reasons.",
     "kinect": "Boxes, apartment and aisle are seen by a simulated Kinect (--camera kinect), which sees up to 6 m.",
 }
-"""Which noise the figures stand on, by camera."""
+"""Noise underlying the figures, by camera."""
 APARTMENT_FRAMES = 902
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much of each experiment is done."""
+    """Size of each experiment."""
 
     box_updates: int = 100
     placements: int = 50
@@ -69,7 +69,7 @@ def reproduce(
     files = output_files(out)
     sizes = QUICK if quick else Sizes()
     steps = Steps(progress, _total(sizes) + (0 if source is None else len(source)))
-    own = [] if source is None else [map_own(source, steps.of("your own recording"))]  # first: it may be of no use
+    own = [] if source is None else [map_own(source, steps.of("your own recording"))]  # first: it may be unusable
     found = [*experiments(sizes, steps, camera), *own]
     lead = f"{LEAD} {NOISE[camera]}"
     result = write_result(files, found, perf_counter() - start, paper="chien2020", title=TITLE, lead=lead, quick=quick)
@@ -89,7 +89,7 @@ def experiments(sizes: Sizes, steps: Steps, camera: str = SIMPLE) -> list[Chapte
     aisles, simulation = compare_aisles(frames=sizes.aisle_frames, camera=camera, step=steps.of("aisle"))
     compared = [compare_tracers(n, frames=sizes.tracer_frames, step=steps.of("ray tracers")) for n in (8, 1)]
     flights = [fly(outside, length_m=sizes.flight_m, step=steps.of("map shifting")) for outside in OUTSIDE]
-    times = time_tables(frames=sizes.timed_frames, step=steps.of("time tables"))  # last: all kernels are compiled
+    times = time_tables(frames=sizes.timed_frames, step=steps.of("time tables"))  # last, when all kernels are compiled
     found = [
         boxes.chapter(two, many, sizes.box_updates),
         grid.chapter(widths),

@@ -40,7 +40,7 @@ _OTHERS = 2 + TIMES
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much of each experiment is done."""
+    """Size of each experiment."""
 
     extent: Extent = Extent()  # noqa: RUF009 - frozen
     variants: tuple[Variant, ...] = VARIANTS
@@ -73,14 +73,14 @@ def floors(out: Path, sizes: Sizes, progress: Progress, places: tuple[Place, ...
     surveys: list[tuple[Place | None, Survey]] = []
     for drive in drives:
         name = drive.place.name
-        with TemporaryDirectory() as folder:  # bags of gigabytes, if somebody asks for more images
+        with TemporaryDirectory() as folder:  # bags of gigabytes, if more images are requested
             recording = record(drive, Path(folder), steps.of(f"driving: {name}"))
             surveys.append((drive.place, survey(recording, sizes.variants, out, steps.of(f"mapping: {name}"))))
     return _chapters(surveys, sizes, steps.of)
 
 
 def own(robot: Robot, out: Path, sizes: Sizes, progress: Progress) -> list[Chapter]:
-    """Return the chapters on somebody's own recording, which need no truth."""
+    """Return the chapters on a user's own recording, which need no truth."""
     steps = Steps(progress, _steps(robot, robot) + _OTHERS)
     name = re.sub(r"[^\w.-]+", "_", Path(robot.name).stem)  # it becomes part of files' names
     recording = Recording(name, robot, robot)

@@ -72,7 +72,7 @@ def _paragraph(text: str) -> str:
 
 
 class Steps:
-    """Counts what is done over all experiments."""
+    """Counts steps over all experiments."""
 
     def __init__(self, progress: Progress, total: int):
         self._progress, self._total, self._done = progress, total, 0
@@ -89,7 +89,7 @@ class Steps:
 
 
 def output_files(out: Path) -> dict[str, Path]:
-    """Return the files to be written; raises StereovoxError now, not after minutes, if they cannot be."""
+    """Return the files to be written; raises StereovoxError now, not after minutes, if they are not writable."""
     out_folder(out)
     files = {"report": out / "report.html", "numbers": out / "numbers.json"}
     for path in files.values():
@@ -111,7 +111,7 @@ def write_result(
 ) -> dict[str, Any]:
     """Write the page and the numbers of all chapters; return the result of the command.
 
-    lead: what the page begins with; heads: of the four columns of claims.
+    lead: the page's introduction; heads: of the four columns of claims.
     Raises StereovoxError if a file cannot be written.
     """
     claims = [claim for chapter in found for claim in chapter.claims]

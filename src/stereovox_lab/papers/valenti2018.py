@@ -37,13 +37,13 @@ LEAD = (
 )
 HEADS = ("claim", "wanted, or thesis", "ours", "holds?")
 TABLE = Setting(0.5, 20.0)
-"""Shown frame by frame, and next to Table 8.1."""
+"""The setting shown frame by frame, and next to Table 8.1."""
 TIMED = Setting(0.2, 20.0)
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is done: settings, and frames of each drive (None: all)."""
+    """Extent of the experiments: settings, and frames of each drive (None: all)."""
 
     settings: tuple[Setting, ...]
     frames: int | None = None

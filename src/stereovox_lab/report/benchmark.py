@@ -12,7 +12,7 @@ from stereovox.view.report import page
 
 
 class Column(NamedTuple):
-    """A figure of the table. better: 1 where more is better, -1 where less is, 0 where neither. scale, digits: shown.
+    """A figure of the table. better: 1 if more is better, -1 if less is, 0 if neither. scale, digits: for display.
 
     meaning: for readers.
     """
@@ -82,7 +82,7 @@ def heads(names: Iterable[str] = COLUMNS) -> tuple[str, ...]:
 
 
 def title_of(result: dict[str, Any], data: str) -> str:
-    """Return what a data set is in one line."""
+    """Return a one-line description of a data set."""
     runs = [about for about in result["data"] if about["name"] == data]
     one = runs[0]
     number = f", {len(runs)} runs" if len(runs) > 1 else ""
@@ -131,7 +131,7 @@ def benchmark_page(result: dict[str, Any]) -> str:
 
 
 def _tables(result: dict[str, Any], data: str) -> Iterator[str]:
-    """Yield two tables, each as wide as a page: of places, and of probabilities and costs."""
+    """Yield two tables, each as wide as a page: on geometry, and on probabilities and costs."""
     of_places = [name for name in COLUMNS if name not in OF_PROBABILITIES]
     for names in (of_places, OF_PROBABILITIES):
         yield page.table(heads(names), rows_of(result, data, names))

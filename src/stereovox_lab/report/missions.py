@@ -55,7 +55,7 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, ...]]:
 def write_missions(folder: str | Path, result: dict[str, Any]) -> dict[str, str]:
     """Write `explore.html`, `explore.json` and `coverage.png` into `folder`; return their paths.
 
-    Raises StereovoxError, one line, where one cannot be written.
+    Raises StereovoxError, one line, if one cannot be written.
     """
     png = coverage_png(result["flights"])
     contents = {

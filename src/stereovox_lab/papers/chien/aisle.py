@@ -28,13 +28,13 @@ from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown, percent
 from stereovox_lab.papers.pictures import SECOND, cut, figure_of, png
 
 FAR_M = 8.0
-"""From this distance on a wall counts as far."""
+"""Walls beyond this distance count as far."""
 MAX_RANGE_M = 13.0
-"""Depths that count here: the profile's 10 m would end before the aisle does."""
+"""Largest depth used here: the profile's 10 m would end before the aisle does."""
 MIN_SHARE = 0.95
-"""Share of what full resolution finds that counts as nothing lost."""
+"""Share of full resolution's findings that counts as nothing lost."""
 MIN_FOUND = 0.9
-"""Least share of the far walls' cells that exact rays find, without which they are no yardstick."""
+"""Least share of the far walls' cells that exact rays find, to serve as a reference."""
 PAPER = (
     "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
     "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
@@ -63,9 +63,9 @@ STRAY = (
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to map the aisle.
+    """One method of mapping the aisle.
 
-    update: see the setting `ray.update`. wanted: whether it must find nearly all that full resolution does.
+    update: see the setting `ray.update`. wanted: whether it must find nearly all that full resolution finds.
     """
 
     name: str
@@ -86,14 +86,14 @@ VARIANTS = (
     Variant("footprint rule, full resolution", "projective", 1, wanted=True),
     Variant("footprint rule, 2x2 minimum", "projective", 2),
 )
-"""The first one is what all are measured by: whatever a pixel saw is in it."""
+"""The first one is the reference: it contains all that any pixel saw."""
 
 
 @dataclass(frozen=True, eq=False)
 class AisleFound:
     """One variant's map. far_cells: cells of walls beyond `FAR_M` that the camera sees; found: share of them occupied.
 
-    near_found: the same for the walls before. against_full: `found` over that of full resolution. stray: share of the
+    near_found: the same for nearer walls. against_full: `found` relative to full resolution. stray: share of the
     occupied cells beyond `FAR_M` that have no wall, floor or ceiling within one cell. ms: a frame, median.
     """
 
@@ -119,7 +119,7 @@ def compare_aisles(
     camera: str = SIMPLE,
     step: Callable[[], None] = lambda: None,
 ) -> tuple[list[AisleFound], Simulation]:
-    """Map the same images of an aisle of 12 m in every way; the first variant is what all are measured by.
+    """Map the same images of an aisle of 12 m with every variant; the first is the reference.
 
     camera: as in the simulation's options.
     """
@@ -151,7 +151,7 @@ def wall_cells(faces: Sequence[Face], size: float) -> tuple[Keys, Keys]:
 
 
 def seen_cells(simulation: Simulation, cells: Keys, size: float) -> Keys:
-    """Return those of `cells` in which a pixel of the standing camera's image ends."""
+    """Return those of `cells` in which a pixel of the static camera's image ends."""
     sightings = Sightings(cells, size)
     sightings.add(simulation.true_depth(0), simulation.camera, simulation.pose(0))
     return cells[sightings.frames > 0]
@@ -226,7 +226,7 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
 
 
 def claims_of(found: Sequence[AisleFound]) -> list[Claim]:
-    """Return what is claimed; the first one found is the yardstick."""
+    """Return what is claimed; the first one found is the reference."""
     lines = [one for one in found if one.variant.integrator == "line" and one.variant.downsample > 1]
     falling = all(a.found >= b.found for a, b in pairwise(lines)) and lines[0].found > lines[-1].found
     ours = ", ".join(f"{one.variant.downsample}x{one.variant.downsample}: {percent(one.found)}" for one in lines)
@@ -237,13 +237,13 @@ def claims_of(found: Sequence[AisleFound]) -> list[Claim]:
 
 
 def _yardstick(exact: AisleFound) -> Claim:
-    """Return whether exact rays find enough to measure others by."""
+    """Return whether exact rays find enough to serve as reference."""
     text = f"{exact.variant.name}: at least {100 * MIN_FOUND:.0f} % of all far cells, to be a yardstick"
     return Claim(text, "-", percent(exact.found), exact.found >= MIN_FOUND)
 
 
 def _claims(one: AisleFound, exact: AisleFound) -> list[Claim]:
-    """Return what is claimed of stereovox's own rule: nearly all that exact rays find, and nothing more next to it."""
+    """Return what is claimed of stereovox's own rule: nearly all that exact rays find, and no more stray cells."""
     text = f"{one.variant.name}: at least {100 * MIN_SHARE:.0f} % of the far cells that exact rays find"
     stray = f"{percent(one.stray)} against {percent(exact.stray)}"
     return [

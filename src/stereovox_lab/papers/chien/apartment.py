@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An apartment scanned by hand (Chien 2020, 4.4.2.1): do its walls stand straight, square and thin in the map?"""
+"""An apartment scanned by hand (Chien 2020, 4.4.2.1): are its walls straight, square and thin in the map?"""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from stereovox_lab.papers.chien.rooms import RoomsFound, measure_rooms
 from stereovox_lab.papers.pictures import OURS, SECOND, cut, figure_of, png
 
 SEEN_FRAMES = 10
-"""A wall is judged where so many frames saw it, of those of a whole scan (902)."""
+"""A wall is judged where this many frames of a whole scan (902) saw it."""
 BATCH = 16
 THINNED = 2
-"""Only every so many pixels, across and down, are asked what they see of a wall: it is the wall's cells that count."""
+"""Stride of pixels, across and down, that are tested for seeing a wall: only the wall's cells count."""
 PAPER = (
     "The result looks precise due to the on-board SLAM and re-localization of the T265. The walls are solid and "
     "straight and the corner is 90 degrees. The floor plan stands next to it; 255 is occupied, 0 free."
@@ -57,7 +57,7 @@ MEASURES = (
     "middle belong to the other room's side."
 )
 SOLID = 0.95
-"""Least share of the columns through walls that hold an occupied cell, where walls are called solid."""
+"""Least share of the columns through walls with an occupied cell, for solid walls."""
 OUTER_M = 7.8
 """Length of the shortest outer wall."""
 LIMITS = (
@@ -151,9 +151,9 @@ POSES = {"T265": "T265 model", "closed": "T265 model, loops closed", "exact": "e
 
 @dataclass(frozen=True)
 class Scan:
-    """One way to map the apartment.
+    """One method of mapping the apartment.
 
-    poses: `T265` (drifting, as the camera pair reports them), `closed` (the same, and in the end all loops are closed),
+    poses: `T265` (drifting, as reported by the camera pair), `closed` (the same, with all loops closed in the end),
     or `exact`.
     """
 
@@ -183,9 +183,9 @@ SCANS = (
 
 @dataclass(frozen=True, eq=False)
 class Apartment:
-    """All scans, the true apartment in their frame, and how far the tracker was off.
+    """All scans, the true apartment in their frame, and the tracker's error.
 
-    way: true positions of the camera (N, 3); reported: what the tracker made of them, NaN where it was refused.
+    way: true positions of the camera (N, 3); reported: the tracker's positions, NaN if refused.
     """
 
     scans: list[RoomsFound]
@@ -195,7 +195,7 @@ class Apartment:
 
     @property
     def drift_m(self) -> NDArray[np.float64]:
-        """How far (N,) the tracker was off in metres."""
+        """Error (N,) of the tracker in metres."""
         return np.linalg.norm(self.reported - self.way, axis=1)
 
 
@@ -207,9 +207,9 @@ def scan_apartment(
     location: str = "sim:apartment",
     step: Callable[[], None] = lambda: None,
 ) -> Apartment:
-    """Walk through the apartment once and map the same images in every way.
+    """Walk through the apartment once and map the same images with every scan.
 
-    every: only each so many-th of the 902 images, 15 a second, is mapped. step: called after each.
+    every: only every `every`-th of the 902 images, 15 a second, is mapped. step: called after each.
     """
     simulation = Simulation(location)
     chosen = range(0, len(simulation), every)
@@ -239,14 +239,14 @@ def scan_apartment(
 
 
 def _recorded(simulation: Simulation, tracker: T265, folder: Path) -> tuple[Recording, CameraPair]:
-    """Record the tracker next to tiny images: the pair tells where the large ones were taken."""
+    """Record the tracker with tiny images: the pair gives the poses of the large ones."""
     tiny = Simulation(f"{simulation.name}{'&' if '?' in simulation.name else '?'}image_width=16", noise=False)
     recording = record(tiny, folder, tracker, MOUNT)
     return recording, CameraPair(folder, open_depth)
 
 
 def _tracked(pair: CameraPair, i: int, exact: Frame) -> Frame:
-    """Return the frame with the pose that the pair has for image `i`, or with the fault that forbids it."""
+    """Return the frame with the pose that the pair has for image `i`, or with its fault."""
     stamp_ns = pair.frame(i).stamp_ns
     try:
         return replace(exact, T_world_sensor=pair.pose_at(stamp_ns))

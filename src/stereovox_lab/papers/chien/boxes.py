@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes before a standing camera (Chien 2020, 4.4.1): how many cells wide do they stand in the map, and where?"""
+"""Boxes in front of a static camera (Chien 2020, 4.4.1): their width in cells in the map, and their position."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from stereovox_lab.papers.pictures import figure_of, png
 
 INTEGRATORS = ("line", "ray")
 UPDATES = 100
-"""Frames that every map takes in, at least (Chien 2020, 4.3.1)."""
+"""Least number of frames of every map (Chien 2020, 4.3.1)."""
 WALL_M, FLOOR_M = 4.1, 1.2
-"""Where the wall stands behind the box, and the floor below the camera."""
+"""Distance of the wall behind the box, and of the floor below the camera."""
 CLEAR_M = 0.6
-"""What is nearer to the wall or to the floor belongs to them; no box is put there."""
+"""Cells nearer to the wall or to the floor belong to them; no box is placed there."""
 NEAREST_M, IN_VIEW = 1.0, 0.9
-"""Nearest front of a box; share of the field of view that it may reach."""
+"""Nearest front of a box; share of the field of view that it may fill."""
 DIRECTIONS = ("left", "right", "top", "bottom", "front")
 TITLES = {"line": "Line drawing", "ray": "Voxel traversal"}
 SIZES_CM = {"large": "47 x 36.5 x 32 cm", "small": "25 x 18.5 x 9 cm"}
@@ -67,7 +67,7 @@ OPEN = (
 
 @dataclass(frozen=True)
 class Placement:
-    """A box: its size by name, distance of its front, and its middle right of and below the optical axis, in metres."""
+    """A box: its size by name, distance of its front, and its middle right of and below the axis, in metres."""
 
     size: str
     distance: float
@@ -82,19 +82,19 @@ class Placement:
         return np.array([low, (low[0] + width, low[1] + height, low[2] + depth)])
 
     def simulation(self, frames: int, camera: str = SIMPLE, subpixel: float = OWN) -> Simulation:
-        """Return what a D435 sees of it, in Chien's map frame; camera, subpixel: as in the simulation's options."""
+        """Return a D435's view of it, in Chien's map frame; camera, subpixel: as in the simulation's options."""
         where = f"sim:box?size={self.size}&distance={self.distance}&x={self.x}&y={self.y}&wall={WALL_M}&axes=optical"
         return Simulation(f"{where}&camera={camera}&subpixel={subpixel}", frames=frames)
 
 
 @dataclass(frozen=True, eq=False)
 class BoxFound:
-    """A box as it stands in a map.
+    """A box as found in a map.
 
-    cells: (N, 3) its occupied cells. errors: (5,) cells by which its left, right, top, bottom and front lie further
-        out (positive) or in than the cells that hold the true sides; None if no cell is occupied.
+    cells: (N, 3) its occupied cells. errors: (5,) cells by which its left, right, top, bottom and front are farther
+        out (positive) or in than the cells with the true sides; None if no cell is occupied.
     width: occupied cells side by side in the fullest row of the layer just below the optical axis.
-    hidden, hidden_known: cells behind the box that no ray can reach, and how many of them are not unknown.
+    hidden, hidden_known: cells behind the box that no ray can reach, and the number of them that are not unknown.
     """
 
     placement: Placement
@@ -108,7 +108,7 @@ class BoxFound:
 
     @property
     def within_one_cell(self) -> bool:
-        """Whether the box is there and no side is more than one cell off."""
+        """Whether the box is found and no side is off by more than one cell."""
         return self.errors is not None and int(np.abs(self.errors).max()) <= 1
 
     def figures(self) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def find_boxes(
 
 
 def map_together(configs: Sequence[Config], simulation: Simulation) -> list[VoxelMap]:
-    """Return one map a config, all made of the same images; the configs differ in what comes after the depth image."""
+    """Return one map per config, all from the same images; the configs differ in steps after the depth image."""
     maps, integrators = [make_map(config) for config in configs], [make_integrator(config) for config in configs]
     for i in range(len(simulation)):
         image = prepare(simulation.frame(i), configs[0])
@@ -172,7 +172,7 @@ def random_placements(number: int, seed: int = 0) -> Iterator[Placement]:
 
 
 def find_box(voxel_map: VoxelMap, place: Placement, integrator: str = "") -> BoxFound:
-    """Return what stands in the map of a box; every occupied cell that is not near wall or floor counts as box."""
+    """Return the box found in a map; every occupied cell that is not near wall or floor counts as box."""
     size = voxel_map.voxel_size
     occupied = voxel_map.occupied()
     box = occupied[(occupied[:, 2] < WALL_M - CLEAR_M) & (occupied[:, 1] < FLOOR_M - CLEAR_M + size)]
@@ -184,9 +184,10 @@ def find_box(voxel_map: VoxelMap, place: Placement, integrator: str = "") -> Box
 
 
 def hidden_centres(place: Placement, size: float) -> NDArray[np.float64]:
-    """Return the centres (N, 3) of all cells that lie wholly in the box's shadow, up to and in the wall.
+    """Return the centres (N, 3) of all cells wholly in the box's shadow, up to and in the wall.
 
-    The shadow is the cone of the front face; it begins one cell behind the box, since a measurement may mark so far.
+    The shadow is the cone of the front face; it begins one cell behind the box, because a measurement may mark that
+    far.
     """
     (x0, y0, front), (x1, y1, back) = place.bounds
     first, last = int(np.floor(back / size)) + 2, int(np.floor(WALL_M / size))
@@ -240,7 +241,7 @@ def space_png(voxel_map: VoxelMap, heading: str) -> bytes:
 
 
 def placements_png(found: Sequence[BoxFound]) -> bytes:
-    """Return how far off each side of the boxes stands, in cells, for both tracers."""
+    """Return the error of each side of the boxes, in cells, for both tracers."""
     figure = figure_of(3.6)
     names = list(dict.fromkeys(one.integrator for one in found))
     for axis, name in zip(figure.subplots(1, len(names), sharey=True, squeeze=False)[0], names, strict=True):
@@ -338,7 +339,7 @@ def _pictures(size: str, found: Sequence[BoxFound]) -> list[Shown]:
 
 
 def _errors_sheet(tracers: Sequence[str], many: Sequence[BoxFound]) -> Sheet:
-    """Return how many boxes are off by so many cells, side by side."""
+    """Return the number of boxes by error in cells, for each side."""
     rows = []
     for name in tracers:
         errors = np.array([one.errors for one in many if one.integrator == name and one.errors is not None])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two boxes at 2 m (Chien 2020, 4.4.1) at many settings: in how many do both stand two cells wide in the map?
+"""Two boxes at 2 m (Chien 2020, 4.4.1) at many settings: in how many are both two cells wide in the map?
 
-The thesis shows one setting and leaves open k, p_min and the clamp of its sensor model, where in their cells the boxes
-stand, and how large the noise was. So its statement is judged over a grid of all these.
+The thesis shows one setting and leaves open k, p_min and the clamp of its sensor model, the boxes' positions within
+their cells, and the noise. So its statement is judged over a grid of all these.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DISTANCE_M = 2.0
 WIDTH = 2
 """Cells side by side, of both boxes (Fig 4.6, 4.9)."""
 CELL_M = 0.2
-"""The thesis's own size of a cell, which its statement is about."""
+"""The thesis's own cell size, to which its statement refers."""
 SHARE = 0.9
 """Least share of the settings in which a statement about them must hold."""
 CHOSEN = "k 0.05 m, p_min 0.25, clamp 0.93"
@@ -41,7 +41,7 @@ MODELS: dict[str, dict[str, float]] = {
     "the same, k 0.02 m": {"sensor.k": 0.02},
     "the same, k 0.1 m": {"sensor.k": 0.1},
 }
-"""Constants of Eq 3.3 that the thesis does not give; the first are those of the profile `chien2020`."""
+"""Constants of Eq 3.3 that the thesis does not give; the first are the profile `chien2020`'s."""
 FACTORS = ("model", "cell", "place", "noise", "updates", "tracer")
 HEADS = ("setting", "settings", "large box: 2 cells", "small box: 2 cells", "both", "share")
 WHY = (
@@ -56,7 +56,7 @@ WHY = (
 class Extent:
     """The values of each factor.
 
-    places: of the camera, and with it the boxes, in cells to the right and ahead of where the thesis has them; noises:
+    places: of camera and boxes, in cells to the right and ahead of the thesis's; noises:
     standard deviation of the disparity in pixels; updates: ascending numbers of frames.
     """
 
@@ -69,13 +69,13 @@ class Extent:
 
     @property
     def images(self) -> int:
-        """How many images are made."""
+        """Number of images."""
         return len(self.noises) * len(BOXES) * self.updates[-1]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One point of the grid, and how many cells wide the boxes stand in its map, by size."""
+    """One point of the grid, and the width in cells of the boxes in its map, by size."""
 
     model: str
     cell: float
@@ -87,7 +87,7 @@ class Setting:
 
     @property
     def gives_it(self) -> bool:
-        """Whether both boxes stand two cells wide."""
+        """Whether both boxes are two cells wide."""
         return all(width == WIDTH for width in self.widths.values())
 
     def text(self, factor: str) -> str:
@@ -105,14 +105,14 @@ class Setting:
 
 
 class _Run:
-    """One map, and where its camera stands. integrator: of these settings; several runs may share one."""
+    """One map, and its camera's place. integrator: of these settings; several runs may share one."""
 
     def __init__(self, config: Config, integrator: Integrator, place: tuple[float, float]):
         self._map, self._integrator, cell = make_map(config), integrator, config.voxel_size
         self._shift = np.array([place[0], 0.0, place[1]]) * cell
 
     def add(self, image: DepthImage) -> None:
-        """Take an image in, as if the camera and all it sees stood elsewhere in the cells."""
+        """Add an image, as if the camera and its view were elsewhere within the cells."""
         T = image.T_world_sensor.copy()
         T[:3, 3] += self._shift
         moved = replace(image, T_world_sensor=T)
@@ -121,12 +121,12 @@ class _Run:
         self._map.frames += 1
 
     def width(self) -> int:
-        """Return the cells side by side of what stands before the wall."""
+        """Return the width in cells of the box in front of the wall."""
         return box_width(self._map, WALL_M - CLEAR_M + float(self._shift[2]))
 
 
 def box_width(voxel_map: VoxelMap, nearer_than: float) -> int:
-    """Return the number of occupied cells side by side in the layer y = 0, of what is nearer along z, in metres."""
+    """Return the number of occupied cells side by side in the layer y = 0, nearer than `nearer_than` metres along z."""
     occupied = voxel_map.occupied()
     return row_width(np.floor(occupied[occupied[:, 2] < nearer_than] / voxel_map.voxel_size).astype(np.int64))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of one's own under the profile of a paper, next to the same under `default`."""
+"""Your own recording under the profile of a paper, and under `default`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ PROFILES = ("chien2020", "default")
 
 
 def overview_png(voxel_map: VoxelMap, way: NDArray[np.float64], heading: str) -> bytes:
-    """Return a map from above, from three sides and cut open, with the camera's way (N, 3)."""
+    """Return a map from above, from three sides and cut open, with the camera's path (N, 3)."""
     return png(draw(voxel_map, heading=heading, trajectory=way, up=voxel_map.config.up), 70)
 
 
 def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:
     """Return a chapter about a recording; without truth there is nothing to claim.
 
-    Raises StereovoxError if no frame of it can be used.
+    Raises StereovoxError if it has no usable frame.
     """
     mappers = {name: Mapper(name, **{"window.size": None, "up": "z"}) for name in PROFILES}
     reports = {name: [] for name in PROFILES}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sides of the apartment's rooms as they stand in a map: thickness, straightness, corners."""
+"""The walls of the apartment's rooms in a map: thickness, straightness, corners."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from stereovox_lab.papers.chien.walls import (
 SIDES = ("west", "south", "east", "north")
 INNER = "outer wall"
 BESIDE_M = 0.15
-"""So far on either side of an inner wall that ends at an outer one the outer one is not judged."""
+"""Metres on either side of an inner wall's end within which the outer wall is not judged."""
 REACH_M = 0.24
-"""Occupied cells up to so far before and behind a wall's face are taken for the wall, which is 0.25 m thick."""
+"""Occupied cells within this distance of a wall's face count as the wall, which is 0.25 m thick."""
 INSET_M = 0.15
-"""So much of a wall next to a corner, the floor and the ceiling is not judged: the other wall stands there too."""
+"""Metres of a wall next to a corner, floor or ceiling that are not judged: the other surface is there too."""
 IN_FRONT_M = 0.4
-"""Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
+"""Occupied cells up to this far in front of a face count as its wall; behind it, up to the wall's middle."""
 INNER_HALF_M, OUTER_M = 0.06, 0.25
 """Half the thickness of inner walls, behind whose middle the other room's face begins; thickness of outer ones."""
 
 
 def measure_outer(voxel_map: VoxelMap, stage: Stage, only: Keys, others: Keys) -> dict[str, WallFound]:
-    """Return the outer walls by side, as their faces towards the rooms stand in a map.
+    """Return the outer walls by side, measured in a map by their faces towards the rooms.
 
-    only, others: see `measure_wall`; places where inner walls end are left out besides.
-    Raises StereovoxError if one of them stands in too few columns.
+    only, others: see `measure_wall`; the ends of inner walls are also left out.
+    Raises StereovoxError if one of them has too few columns.
     """
     ends = _inner_walls(stage, voxel_map.voxel_size)
     of_side = {side: [face for face in stage.faces if face.name.endswith(f" {side}")] for side in SIDES}
@@ -62,7 +62,7 @@ def outer_corners(walls: dict[str, WallFound]) -> dict[str, float]:
 
 
 def grown(solid: Solid, metres: float) -> Solid:
-    """Return a box that is larger by so much on every side."""
+    """Return a box that is larger by `metres` on every side."""
     normals, offsets = solid.planes[:, :3], solid.planes[:, 3]
     corners = solid.triangles.reshape(-1, 3)
     on = np.abs(corners @ normals.T - offsets) < 1e-6
@@ -70,7 +70,7 @@ def grown(solid: Solid, metres: float) -> Solid:
 
 
 def _whole_face(side: str, faces: Sequence[Face]) -> Wall:
-    """Return the outermost of these faces, which look one way, made as long as all that lie in its plane."""
+    """Return the outermost of these faces, all facing one way, extended over all those in its plane."""
     normal = faces[0].normal
     depth = [float(face.corners[0] @ normal) for face in faces]
     coplanar = [face for face, at in zip(faces, depth, strict=True) if at < min(depth) + 1e-6]
@@ -93,8 +93,8 @@ def _inner_walls(stage: Stage, size: float) -> NDArray[np.int64]:
 class RoomsFound:
     """The walls of one map, `name` in tables and pictures.
 
-    walls: one for each side of a room that could be measured; missing: the others, each with the number of columns that
-    were seen well and in which at most two hold a cell; corners_deg: the rooms' angles.
+    walls: one for each measurable side of a room; missing: the others, each with its number of well-seen columns with
+    at most two occupied cells; corners_deg: the rooms' angles.
     outer: the apartment's own four walls, along several rooms each.
     """
 
@@ -140,7 +140,7 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
     """Measure all sides of all rooms in a map in Chien's axes (y down).
 
     stage: the apartment in the map's frame; well_seen: cells that its walls touch and that were seen often enough.
-    Raises StereovoxError if not one wall can be measured.
+    Raises StereovoxError if no wall can be measured.
     """
     size = voxel_map.voxel_size
     others = _other_things(stage, size)
@@ -161,25 +161,25 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
 def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, others: Keys | None = None) -> WallFound:
     """Measure one side of a room. Cells behind the middle of an inner wall belong to the other room's side.
 
-    Raises StereovoxError if too little of it stands in the map.
+    Raises StereovoxError if too little of it is in the map.
     """
     behind = OUTER_M if _outer(face.name) else INNER_HALF_M
     return measure_wall(_only_near(voxel_map, face, behind), _inset(face), only=only, others=others, reach=IN_FRONT_M)
 
 
 def seen_columns(face: Face, size: float, only: Keys, others: Keys) -> int:
-    """Return how many columns through one side of a room, in cells of `size` metres, `measure_face` looks at."""
+    """Return the number of columns through one side of a room, in cells of `size` metres, for `measure_face`."""
     return len(judged_columns(_inset(face), size, only=only, others=others, reach=IN_FRONT_M))
 
 
 def _occupied(voxel_map: VoxelMap) -> VoxelMap:
-    """Return a map of the occupied cells alone: smaller, for what looks at no others."""
+    """Return a map of the occupied cells alone: smaller, for code that needs no others."""
     cells = occupied_cells(voxel_map)
     return VoxelMap.from_cells(voxel_map.config, cells, np.full(len(cells), voxel_map.config.map.log_odds_max))
 
 
 def _only_near(voxel_map: VoxelMap, face: Face, behind: float) -> VoxelMap:
-    """Return a map of the cells that lie before the face, or up to `behind` metres behind it."""
+    """Return a map of the cells in front of the face, or up to `behind` metres behind it."""
     cells, log_odds = voxel_map.cells()
     height = (voxel_map.centers(cells) - face.corners[0]) @ face.normal
     kept = (height >= -behind) & (height <= IN_FRONT_M)
@@ -194,7 +194,7 @@ def _inset(face: Face) -> Wall:
 
 
 def _outer(name: str) -> bool:
-    """Tell whether there is no other room behind a face: it stands at the apartment's rim."""
+    """Return whether there is no other room behind a face: it is at the apartment's rim."""
     room, _, side = name.rpartition(" ")
     index = SIDES.index(side)
     rim = [limits[index] for limits in ROOMS.values()]
@@ -202,13 +202,13 @@ def _outer(name: str) -> bool:
 
 
 def _other_things(stage: Stage, size: float) -> Keys:
-    """Return the cells of all that stands in the rooms: furniture and door frames."""
+    """Return the cells of furniture and door frames."""
     others = [solid for solid in stage.scene.solids if solid.part not in ("walls", "floor", "ceiling")]
     return np.unique(keys(np.concatenate([touched_cells(solid.triangles, size) for solid in others])))
 
 
 def _corners(walls: dict[str, WallFound]) -> dict[str, float]:
-    """Return the angle in every corner of a room both of whose walls were measured."""
+    """Return the angle in every room corner whose walls were both measured."""
     angles = {}
     for room in ROOMS:
         for a, b in zip(SIDES, (*SIDES[1:], SIDES[0]), strict=True):

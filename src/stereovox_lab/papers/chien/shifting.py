@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map shifting (Chien 2020, 3.6): a flight whose window moves with the camera, and what a move costs."""
+"""Map shifting (Chien 2020, 3.6): a flight whose window moves with the camera, and the cost of a move."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from stereovox_lab.papers.pictures import OURS, SECOND, THESIS, figure_of, png
 DOWNSAMPLE = 2
 """Images of the flight are 212 pixels wide: 2x2 of them are 8x8 of a D435."""
 OUTSIDE = ("drop", "keep")
-"""What happens to cells that leave the window: lost, or kept in tiles on disk."""
+"""Cells that leave the window: lost, or kept in tiles on disk."""
 NEAR_M = 0.5
-"""Cells up to so far above and below the first camera are drawn: without floor and ceiling."""
+"""Height in metres above and below the first camera of drawn cells: without floor and ceiling."""
 PAPER = (
     "Once the camera hits the trigger boundary, the whole map shifts one unit; the dynamic region moves with the "
     "vehicle and is the only one that is updated. Cells outside are eliminated and can be stored in another memory, "
@@ -78,7 +78,7 @@ class Flight:
 
     @property
     def most_off_m(self) -> float:
-        """How far the camera ever was from the window's middle, along any axis, in metres."""
+        """Largest distance of the camera from the window's middle, along any axis, in metres."""
         return float(np.abs(self.way - self.windows.mean(axis=1)).max())
 
 
@@ -116,7 +116,7 @@ def _tiles(voxel_map: RollingMap) -> NDArray[np.float64]:
 
 
 def flight_png(flight: Flight) -> bytes:
-    """Return the flight from above with windows and tiles (after Fig 3.14 to 3.16), and what moves cost."""
+    """Return the flight from above with windows and tiles (after Fig 3.14 to 3.16), and the cost of moves."""
     figure = figure_of(7.0)
     left, right = figure.subplots(1, 2, width_ratios=[2.4, 1])
     _flight_plan(left, flight)

@@ -29,11 +29,11 @@ from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown
 from stereovox_lab.papers.pictures import OURS, THESIS, figure_of, png
 
 BATCH = 25
-"""Frames simulated at a time; then every step goes over all of them, so that simulating is not timed."""
+"""Frames simulated at once; then every step runs over all of them, so that simulation is not timed."""
 FIRST = 10
-"""Frames at the start that are not counted: they compile kernels, make room and fill caches."""
+"""Frames at the start that are not counted: they compile kernels, allocate and fill caches."""
 VIEW_EVERY = 5
-"""Views are made after every so many frames only: they take longer than all the rest."""
+"""Views are drawn only once per this many frames: they take longer than all the rest."""
 STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
 FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
 MEANS = (
@@ -51,7 +51,7 @@ VIEWS = (
 
 @dataclass(frozen=True)
 class Step:
-    """A row of Table 4.2: its name, the thesis's milliseconds (None: not in the thesis), and what we timed for it."""
+    """A row of Table 4.2: its name, the thesis's milliseconds (None: not in the thesis), and our timed equivalent."""
 
     name: str
     thesis_ms: float | None
@@ -62,7 +62,7 @@ class Step:
 class Condition:
     """A row of Table 4.3: one whole frame, from the raw image to the map (and the picture).
 
-    views: which pictures are made of the map after each frame, `2D`, `3D` or both.
+    views: pictures drawn after each frame, `2D`, `3D` or both.
     """
 
     name: str
@@ -97,7 +97,7 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class Timed:
-    """Milliseconds of a row: median, 90 and 99 %, longest; how many frames, and the mean that the thesis gives."""
+    """Milliseconds of a row: median, 90 and 99 %, longest; number of frames, and the thesis's mean."""
 
     row: Step | Condition
     ms: dict[str, float]
@@ -130,7 +130,7 @@ def time_tables(
 
 
 def processor() -> str:
-    """Return the name of this machine's processor, as far as it tells."""
+    """Return the name of this machine's processor, if known."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:

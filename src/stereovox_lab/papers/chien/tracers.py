@@ -28,7 +28,7 @@ from stereovox_lab.papers.pictures import figure_of, png
 
 TRACERS = ("ray", "line")
 RIM_CELLS = 1.5
-"""A cell whose centre is so many cell widths or less inside the field of view, or outside it, lies at its rim."""
+"""A cell is at the rim if its centre is at most this many cell widths inside the field of view, or outside it."""
 PAPER = (
     "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
     "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
@@ -55,7 +55,7 @@ class Comparison:
     """Both tracers at one downsampling. Counts are summed over all frames.
 
     ray, line, both: cells that a frame updates. only_ray, only_line: by one of them alone; at_rim: those of only_ray
-    that lie at the rim of the field of view. occupied_*: cells of the finished maps. updated: of the last frame, keys
+    at the rim of the field of view. occupied_*: cells of the finished maps. updated: of the last frame, keys
     by tracer; its camera position is `eye`.
     """
 
@@ -118,7 +118,7 @@ def compare_tracers(
 
 
 def updated_cells(evidence: Evidence) -> NDArray[np.int64]:
-    """Return the cells (N, 3) on which evidence says anything."""
+    """Return the cells (N, 3) with evidence."""
     block, column = np.nonzero(evidence.values)
     low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
     cells = evidence.coords[block].astype(np.int64) * SIDE + low
@@ -128,7 +128,7 @@ def updated_cells(evidence: Evidence) -> NDArray[np.int64]:
 
 
 def near_rim(cells: NDArray[np.integer], camera: PinholeCamera, T_world_camera: Transform, size: float) -> NDArray:
-    """Tell which cells (N, 3) lie at the rim of the field of view, outside it, or about the camera."""
+    """Return which cells (N, 3) are at the rim of the field of view, outside it, or around the camera."""
     x, y, z = transform_points(inverse(T_world_camera), (cells + 0.5) * size).T
     z = np.maximum(z, 1e-9)
     u, v = camera.fx * x / z + camera.cx + 0.5, camera.fy * y / z + camera.cy + 0.5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How thick, how straight and how square do known walls stand in a map?"""
+"""Thickness, straightness and squareness of known walls in a map."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import Solid
 
 REACH = 0.4
-"""Metres before and behind a wall's face within which occupied cells are taken for the wall."""
+"""Metres before and behind a wall's face within which occupied cells count as the wall."""
 FLAT = 1e-6
-"""How far in metres a corner may stand off the face of a solid that it belongs to."""
+"""Largest distance in metres of a corner from the face of its solid."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A flat rectangle whose place is known.
+    """A flat rectangle in a known place.
 
     corner: (3,) one corner in metres, world frame; along: (2, 3) its two sides from there, at right angles.
-    normal: (3,) unit vector that points to where the wall is seen from.
+    normal: (3,) unit vector towards the viewer.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Wall:
 
     @classmethod
     def of(cls, solid: Solid, towards: ArrayLike) -> Wall:
-        """Return the face of a box that looks most to direction `towards` (3,). Raises StereovoxError for no box."""
+        """Return the face of a box that faces direction `towards` (3,) most. Raises StereovoxError for other solids."""
         planes = solid.planes
         plane = planes[np.argmax(planes[:, :3] @ np.asarray(towards, float))]
         corners = np.unique(solid.triangles.reshape(-1, 3).round(9), axis=0)
@@ -48,10 +48,10 @@ class Wall:
 
 @dataclass(frozen=True, eq=False)
 class WallFound:
-    """A wall as it stands in a map.
+    """A wall as found in a map.
 
     thickness: (N,) occupied cells in each column of cells through the wall, columns without any left out.
-    columns: number of columns looked at, empty ones among them.
+    columns: number of columns inspected, including empty ones.
     offset: metres from the true face to the plane fitted to the occupied cells, positive towards the viewer.
     straightness: root mean square distance in metres of each column's middle from that plane.
     normal: (3,) unit normal of the fitted plane, on the viewer's side.
@@ -76,9 +76,9 @@ def measure_wall(
 
     Columns run along the world axis nearest to the wall's normal, so a wall along the axes is measured straight
     through. Columns within one cell of the rectangle's rim are left out: another wall begins there.
-    only: cells (N,) that were seen well; columns without one are left out. others: cells that something else than the
-    wall touches; columns with one within `reach` metres of the face are left out.
-    Raises StereovoxError if fewer than three columns hold an occupied cell.
+    only: cells (N,) that were seen well; columns without one are left out. others: cells touched by objects other than
+    the wall; columns with one within `reach` metres of the face are left out. Raises StereovoxError if fewer than three
+    columns have an occupied cell.
     """
     size = voxel_map.voxel_size
     occupied = _near(occupied_cells(voxel_map), wall, size, reach)
@@ -99,7 +99,7 @@ def measure_wall(
 def judged_columns(
     wall: Wall, size: float, *, only: Keys | None = None, others: Keys | None = None, reach: float = REACH
 ) -> Keys:
-    """Return the columns (N,) through `wall` that `measure_wall` looks at, ascending; empty if none was seen well.
+    """Return the columns (N,) through `wall` used by `measure_wall`, ascending; empty if none was seen well.
 
     size: side of a cell in metres; the others: see `measure_wall`.
     """
@@ -136,7 +136,7 @@ def corner_deg(one: WallFound, other: WallFound) -> float:
 def thickness_figures(walls: Sequence[WallFound]) -> dict[str, float | int]:
     """Return columns, median, 95th percentile and share of at most 2 cells of the thickness of several walls, in cells.
 
-    found: share of the columns that hold an occupied cell at all.
+    found: share of the columns with any occupied cell.
     """
     cells = np.concatenate([wall.thickness for wall in walls])
     columns = sum(wall.columns for wall in walls)
@@ -150,7 +150,7 @@ def thickness_figures(walls: Sequence[WallFound]) -> dict[str, float | int]:
 
 
 def _near(cells: NDArray[np.integer], wall: Wall, size: float, reach: float) -> NDArray[np.int64]:
-    """Return the cells (N, 3) whose centre lies within `reach` of the face and not within a cell of its rim."""
+    """Return the cells (N, 3) whose centre is within `reach` of the face but not within a cell of its rim."""
     centre = (cells + 0.5) * size - wall.corner
     length = np.linalg.norm(wall.along, axis=1)
     place = centre @ (wall.along / length[:, None]).T
@@ -159,14 +159,14 @@ def _near(cells: NDArray[np.integer], wall: Wall, size: float, reach: float) -> 
 
 
 def _over(wall: Wall, size: float) -> NDArray[np.int64]:
-    """Return the cells (N, 3) that the face lies in."""
+    """Return the cells (N, 3) that contain the face."""
     steps = [np.arange(0, 1, size / 4 / np.linalg.norm(side)) for side in wall.along]
     a, b = (grid.ravel()[:, None] for grid in np.meshgrid(*steps, indexing="ij"))
     return np.unique(np.floor((wall.corner + a * wall.along[0] + b * wall.along[1]) / size).astype(np.int64), axis=0)
 
 
 def _column(cells: NDArray[np.integer], axis: int) -> Keys:
-    """Return the key (N,) of the column along `axis` that each cell stands in."""
+    """Return the key (N,) of each cell's column along `axis`."""
     flat = np.array(cells)
     flat[:, axis] = 0
     return keys(flat)

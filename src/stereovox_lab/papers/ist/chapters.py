@@ -72,7 +72,7 @@ def maps_sheet(found: Survey) -> Sheet:
 
 
 def cells_sheet(found: Survey) -> Sheet:
-    """Return what each map's error is made of."""
+    """Return the parts of each map's error."""
     heads = (
         "map",
         "missed",
@@ -92,7 +92,7 @@ def cells_sheet(found: Survey) -> Sheet:
 
 
 def building_sheet(found: Survey) -> list[Sheet]:
-    """Return scores against the simulated building; none for somebody's own recording."""
+    """Return scores against the simulated building; none for a user's own recording."""
     if found.of_building is None:
         return []
     heads = ("map", "building", *ERROR_HEADS, "walls IoU", "within 1 cell", "free IoU", "known [%]",
@@ -104,7 +104,7 @@ def building_sheet(found: Survey) -> list[Sheet]:
 
 
 def poses_sheet(found: Survey) -> list[Sheet]:
-    """Return how far the ways are off; none without truth."""
+    """Return the errors of the trajectories; none without truth."""
     heads = ("way", "off, RMS [cm]", "largest [cm]", "turn, RMS [deg]", "in 1 m of way [cm]", "seconds")
     ways = {
         "SLAM, first drive": (found.reference.way_error, found.reference.seconds),
@@ -141,7 +141,7 @@ def _cm(metres: float | None) -> str:
 
 
 def fans_png(fans: Sequence[Fan]) -> bytes:
-    """Return the maps that synthetic beams made, side by side, with counted cells (after Fig 3)."""
+    """Return the maps made by synthetic beams, side by side, with counted cells (after Fig 3)."""
     figure = figure_of(8.0)
     for axis, fan in zip(figure.subplots(1, len(fans), squeeze=False)[0], fans, strict=True):
         _fan(axis, fan)
@@ -149,7 +149,7 @@ def fans_png(fans: Sequence[Fan]) -> bytes:
 
 
 def floor_png(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None) -> bytes:
-    """Return a floor's map with the robot's way."""
+    """Return a floor's map with the robot's trajectory."""
     return png(draw_grid(grid, heading, track), MAP_DPI)
 
 
@@ -187,7 +187,7 @@ def fans_chapter(many: Fan, few: Fan) -> Chapter:
 
 
 def floor_chapter(found: Survey, place: Place | None) -> Chapter:
-    """Return all about one floor. place: what the report says of it; None for a recording of somebody's own."""
+    """Return the chapter on one floor. place: the report's description; None for a user's own recording."""
     name = found.recording.name
     title = place.title if place else f"Your recording: {name}"
     said = place.figures if place else ("Reference map", "Map by the depth camera", "Difference")

@@ -16,19 +16,19 @@ from stereovox_lab.papers.ist.survey import Judged, Survey
 from stereovox_lab.papers.ist.variants import MIDDLE, OURS, THEIRS
 
 RIGHT, AREA = 0.98, 0.03
-"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
+"""Least share of places on the beams with the right state; largest difference of counted cells from the areas."""
 TARGET_PERCENT = 10.0
 WALL_M, WAY_M = 0.04, 0.10
-"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
+"""Largest median distance in metres of walls from the reference's; largest RMS error in metres of a trajectory."""
 FOUND = 0.9
-"""Least share of the reference's wall cells that have one of the map within a cell."""
+"""Least share of the reference's wall cells with a map wall cell within one cell."""
 HIDDEN = 0.9
-"""Least share of what the reference knows behind a shut door that a map must not know."""
+"""Least share of the reference's known cells behind a shut door that must be unknown to a map."""
 DRAWN_ODOMETRY = "ist2019, odometry"
 
 
 def numbers_of(found: Survey) -> dict[str, Any]:
-    """Return maps, scores, ways and times."""
+    """Return maps, scores, trajectories and times."""
     slam = found.reference.slam
     return {
         "scans": len(found.recording.robot.scans),
@@ -80,7 +80,7 @@ def fan_claims(many: Fan, few: Fan) -> list[Claim]:
 
 
 def claims_of(found: Survey, place: Place | None) -> list[Claim]:
-    """Return the claims on one floor; on somebody's own recording nothing is claimed."""
+    """Return the claims on one floor; there are none for a user's own recording."""
     theirs, ours, middle = (found.judged[name] for name in (THEIRS, OURS, MIDDLE))
     told = place.error_percent if place else None
     claims = [
@@ -123,7 +123,7 @@ def _doubted(claim: Claim) -> Claim:
 
 
 def _door(one: Judged) -> Claim:
-    """Return whether the region left out is the one that the shut door hides, and not some other."""
+    """Return whether the excluded region is the one hidden by the shut door."""
     states, known = three_states(one.laid.map), three_states(one.laid.reference) != State.UNKNOWN
     known &= one.laid.excluded
     hidden = known & (states == State.UNKNOWN)
@@ -157,7 +157,7 @@ def _beside(one: Judged) -> Claim:
 
 
 def _band(ours: Judged, theirs: Judged) -> list[Claim]:
-    """Return what a robot needs to know: all that stands in its way, which the lidar's reference does not."""
+    """Return the claims on all obstacles in a robot's way, which the lidar's reference does not contain."""
     if not (ours.of_building and theirs.of_building):
         return []
     mine, printed = (one.of_building["band"].eq7_percent for one in (ours, theirs))
@@ -178,7 +178,7 @@ def _walls(one: Judged) -> Claim:
 
 
 def _found(one: Judged) -> Claim:
-    """Return whether the map has the reference's walls; Eq 7 hardly tells, as few cells are walls."""
+    """Return whether the map has the reference's walls; Eq 7 hardly shows it, because few cells are walls."""
     share = one.scores.occupied.tolerance_recall
     ours = "no walls" if share is None else f"{100 * share:.1f}\u00a0%"
     text = f"{one.made.variant.name}: the reference's wall cells that have one of the map within one cell"

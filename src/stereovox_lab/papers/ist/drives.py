@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two floors of IST 2019 in simulation: which drives, and the bags they are recorded in."""
+"""The two floors of IST 2019 in simulation: the drives, and their bags."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from stereovox.sources.robots.robot import Robot
 
 @dataclass(frozen=True)
 class Place:
-    """A floor of the report and what the report says of it.
+    """A floor of the report, with the report's figures.
 
-    drive: parameters of `sim:floor` for the drive whose depth images are mapped; first: those of an earlier drive, of
-    the lidar alone, that the reference map is made from (empty: of the same drive).
+    drive: parameters of `sim:floor` for the drive whose depth images are mapped; first: of an earlier drive, with
+    the lidar alone, for the reference map (empty: the same drive).
     figures: of the report: reference, map, difference. error_percent: its Eq 7; update_s: its time of an update.
     """
 
@@ -59,7 +59,7 @@ PLACES = (
 
 @dataclass(frozen=True)
 class Extent:
-    """How much of each drive is recorded: parameters of `sim:floor` for the mapped drive and for the first one."""
+    """Extent of each drive's recording: parameters of `sim:floor` for the mapped drive and for the first one."""
 
     drive: str = "depth_hz=2.5"
     first: str = ""
@@ -67,7 +67,7 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive that is about to be recorded. first: the earlier one; the same if there is none."""
+    """A drive to be recorded. first: the earlier one; the same if there is none."""
 
     place: Place
     floor: Floor
@@ -98,9 +98,9 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What is mapped (robot), and what the reference map is made from (first; may be the same).
+    """The recording to be mapped (robot), and the one for the reference map (first; may be the same).
 
-    drive: the simulation it was recorded from, for truth; None for somebody's own. megabytes: of all bags.
+    drive: the simulation it was recorded from, for truth; None for a user's own. megabytes: of all bags.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Recording:
 
 
 def messages(drive: Drive) -> int:
-    """Return how many steps `record` takes."""
+    """Return the number of steps of `record`."""
     return sum(len(floor.odometry) + len(floor.scans) + len(floor.frames) for floor in drive.floors)
 
 

@@ -19,21 +19,21 @@ from stereovox.maps.voxel_map import State
 FIELD_DEG = 57.0
 """Horizontal field of view of the Kinect (III-C)."""
 MANY, DISTANCE = 700, 3.0
-"""Beams of the first simulation, and the distance of all of them in metres (not given)."""
+"""Beams of the first simulation, and their common distance in metres (not given in the report)."""
 FEW = (1.2, 2.6, 3.4, 1.8, 4.4, 3.0, 2.2, 4.0, 1.5, 2.9)
-"""Metres that the beams of the second one measure (not given)."""
+"""Distances in metres of the second one's beams (not given in the report)."""
 UPDATES = 60
-"""So many equal scans; one alone leaves a free cell at 0.4, which is not yet called free."""
+"""Number of equal scans; one alone leaves a free cell at 0.4, which is not yet called free."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """What beams made of an empty map.
+    """The map that beams make from an empty one.
 
-    right: share of places along all beams (before the object and in it) that have a cell of the state they should have
-    no further than one cell away: a line in a grid leaves the beam by so much.
-    free, occupied: cells; expected_free, expected_occupied: what the areas of sector and ring give, the ring a cell
-    wider than the thickness, since both its ends are drawn (None: few beams).
+    right: share of places along all beams (before the object and in it) with a cell of the right state at most one cell
+    away: a line in a grid deviates from the beam by that much.
+    free, occupied: cells; expected_free, expected_occupied: from the areas of sector and ring, the ring a cell
+    wider than the thickness, because both its ends are drawn (None: few beams).
     beyond: known cells that no beam reaches. ms: of one update.
     """
 
@@ -49,7 +49,7 @@ class Fan:
 
 
 def simulate(distances: ArrayLike, step: Callable[[], None] = lambda: None) -> Fan:
-    """Return what beams of these lengths (N,), evenly spread over the Kinect's field of view, make of an empty map."""
+    """Return the map from beams of these lengths (N,), evenly spread over the Kinect's field of view."""
     config, scan = load_config("ist2019"), _scan(np.asarray(distances, np.float32))
     mapper = GridMapper(config)
     reports = [mapper.add(scan) for _ in range(UPDATES)]
@@ -77,7 +77,7 @@ def _scan(distances: NDArray[np.float32]) -> Scan:
 
 
 def _right(mapper: GridMapper, scan: Scan, config: Config) -> float:
-    """Return `Fan.right`; places a cell's side or less from where the measurement ends are left out."""
+    """Return `Fan.right`; places within a cell's side of the measurement's end are left out."""
     directions, size, right = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), config.voxel_size, []
     for direction, r in zip(directions, scan.ranges.astype(float), strict=True):
         before = np.arange(size, r - size, size / 2)[:, None] * direction
@@ -87,14 +87,14 @@ def _right(mapper: GridMapper, scan: Scan, config: Config) -> float:
 
 
 def _has_state(mapper: GridMapper, points: NDArray[np.float64], state: State) -> NDArray[np.bool_]:
-    """Tell which points (N, 2) have a cell of this state at most one cell away."""
+    """Return which points (N, 2) have a cell of this state at most one cell away."""
     size = mapper.map.voxel_size
     around = [points + np.array([x, y]) * size for x in (-1, 0, 1) for y in (-1, 0, 1)]
     return np.any([mapper.map.state(one) == state for one in around], axis=0)
 
 
 def _beyond(grid: OccupancyGrid, scan: Scan, config: Config) -> int:
-    """Return how many known cells lie further out than the longest beam and its object."""
+    """Return the number of known cells beyond the longest beam and its object."""
     rows, columns = np.nonzero(grid.cells >= 0)
     away = np.linalg.norm(grid.centres(rows, columns), axis=1)
     return int((away > scan.ranges.max() + config.grid.thickness + config.voxel_size).sum())

@@ -23,7 +23,7 @@ TIMES = 3
 @dataclass(frozen=True)
 class Published:
     """Median seconds of each part. picture: from the map's tiles to one array of per cent; message: from there to a
-    `nav_msgs/OccupancyGrid` in a file, which is more than handing it over.
+    `nav_msgs/OccupancyGrid` in a file, which costs more than passing it on.
     """
 
     side: int
@@ -32,7 +32,7 @@ class Published:
 
 
 def time_publishing(side: int = SIDE, step: Callable[[], None] = lambda: None) -> Published:
-    """Return how long a map of `side` x `side` cells takes, a third of them unknown, free and occupied each."""
+    """Return the times for a map of `side` x `side` cells, a third each unknown, free and occupied."""
     cells = np.random.default_rng(0).choice(np.array([-1, 0, 100], np.int8), (side, side))
     grid_map = GridMap.from_occupancy(OccupancyGrid(cells, 0.02), load_config("ist2019"))
     grid_map.occupancy()

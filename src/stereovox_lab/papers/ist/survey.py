@@ -30,16 +30,16 @@ CELL = 0.02
 """Metres (II-B); the reference has cells of the same size."""
 BAND = (0.1, 1.8)
 HEIGHTS = {"lidar": (0.225, 0.225), "band": BAND, "above": BAND}
-"""Slices of the building that maps are compared with: what the lidar sees, what a robot bumps into, and the same with
-the tops and undersides that a 3-D map has inside of the rims (`simulate/floors/view.py`)."""
+"""Slices of the building that maps are compared with: the lidar's view, what a robot bumps into, and the same with the
+tops and undersides that a 3-D map has inside the rims (`simulate/floors/view.py`)."""
 Step = Callable[[], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The map made from the lidar, as it was read back from its files.
+    """The map from the lidar, as read back from its files.
 
-    way_error: of SLAM's way, None without truth. seconds: that SLAM took. files: .yaml written.
+    way_error: of SLAM's trajectory, None without truth. seconds: SLAM's time. files: .yaml written.
     """
 
     grid: OccupancyGrid
@@ -66,7 +66,7 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """All that came of one recording. of_building: the reference map against the building."""
+    """All results of one recording. of_building: the reference map against the building."""
 
     recording: Recording
     reference: Reference
@@ -115,7 +115,7 @@ def _check(robot: Robot) -> None:
 
 
 def _reference(recording: Recording, out: Path, step: Step) -> Reference:
-    """Make the map by SLAM, draw it anew in small cells along SLAM's way, write it and read it back (III)."""
+    """Make the map by SLAM, redraw it in small cells along SLAM's trajectory, write it and read it back (III)."""
     robot, began = recording.first, perf_counter()
     slam = map_scans(robot.scans, load_config("ist2019"), lambda *_: step())
     seconds = perf_counter() - began
@@ -133,7 +133,7 @@ def _lidar_config() -> Config:
 
 
 def _pose_world_map(reference: Reference) -> se2.Pose | None:
-    """Return where the reference's frame stands in the building, as far as SLAM's whole way tells."""
+    """Return the pose of the reference's frame in the building, estimated from SLAM's whole trajectory."""
     return None if reference.way_error is None else reference.way_error.motion
 
 
@@ -148,7 +148,7 @@ def _judge(made: Made, reference: Reference, excluded: list[Rectangle], recordin
 def _of_building(
     grid: OccupancyGrid, recording: Recording, reference: Reference, heights: str, first: bool = False
 ) -> GridScores | None:
-    """Return the scores of a map against a slice of the simulated building; None for somebody's own recording."""
+    """Return the scores of a map against a slice of the simulated building; None for a user's own recording."""
     pose = _pose_world_map(reference)
     if recording.drive is None or pose is None:
         return None

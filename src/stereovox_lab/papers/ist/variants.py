@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of one drive by its depth images, made in several ways at once, since reading an image costs most."""
+"""Maps of one drive from its depth images, in several variants at once, because reading images costs most."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALL = {"voxel_size": 0.02, "max_range": REACH}
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to make the map. poses: whose; space: a 3-D map first, which is then projected onto the floor."""
+    """A variant of the map. poses: their source; space: a 3-D map first, then projected onto the floor."""
 
     name: str
     file: str
@@ -53,7 +53,7 @@ VARIANTS = (
     Variant("default, true poses", "default_row_true", "the middle row, once a scan, poses without error",
             settings={**SMALL, "scan.method": "rows"}, poses=TRUTH),
 )  # fmt: skip
-"""The first is the report's, the others ours; the last ones tell what is due to the poses."""
+"""The first is the report's, the others ours; the last ones show the effect of the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +67,14 @@ class Made:
 
 @dataclass(frozen=True, eq=False)
 class Makes:
-    """What the maps are made of: images, the way found, and where the map's frame stands in the true world."""
+    """Inputs of the maps: images, the trajectory found, and the map frame's pose in the true world."""
 
     recording: Recording
     track: Track
     pose_world_map: se2.Pose | None
 
     def can(self, variant: Variant) -> bool:
-        """Tell whether the poses that a variant wants are known."""
+        """Return whether the poses that a variant needs are known."""
         return variant.poses != TRUTH or (self.pose_world_map is not None and self.recording.drive is not None)
 
     def placed(self, frame: Frame, poses: str) -> Frame:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where thresholds are chosen and where they are scored: never on the same part of a street.
+"""Thresholds are never chosen and scored on the same part of a street.
 
-Of several drives each is scored at thresholds chosen on all the others. A single drive is cut in two along its way:
-thresholds are chosen on the first half of the street and scored on the second, with a strip between that counts for
-neither.
+With several drives each is scored at thresholds chosen on all the others. A single drive is cut in two along its path:
+thresholds are chosen on the first half of the street and scored on the second, with an ignored strip between them.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ NOT_APART = "one drive alone, which cannot be cut in two; add another drive"
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A map, and the scores that claims are made of. All by the kind of truth, `view` and `rays`.
+    """A map, and the scores for claims. All by the kind of truth, `view` and `rays`.
 
-    chosen: precision and recall where thresholds are chosen; None if there is no such place. scored: scores of the
-    rest, which thresholds are never chosen on. where: both places, in words.
+    chosen: precision and recall on the part for choosing thresholds; None if there is none. scored: scores of the
+    rest, on which thresholds are never chosen. where: both parts, in words.
     """
 
     judged: Judged
@@ -45,7 +44,7 @@ class Apart:
         return at(self.scored[kind].curve, self.chosen[kind].best(names, wanted)["threshold"])
 
     def numbers(self) -> dict[str, Any]:
-        """Return all figures, fit for JSON: those of the whole drive, and apart those of the scored part."""
+        """Return all figures, fit for JSON: for the whole drive, and separately for the scored part."""
         apart = {
             kind: {
                 **figures(scores),
@@ -58,7 +57,7 @@ class Apart:
 
 
 def apart(judged: Sequence[Judged]) -> list[Apart]:
-    """Return the maps of all drives, in their order, each with where its thresholds are chosen and scored."""
+    """Return the maps of all drives, in order, each with its parts for choosing and scoring thresholds."""
     return [_apart(one, [other for other in judged if _same_but_drive(one, other)]) for one in judged]
 
 
@@ -82,7 +81,7 @@ def _apart(one: Judged, others: Sequence[Judged]) -> Apart:
 
 
 def _mean(curves: Sequence[PrecisionRecall]) -> PrecisionRecall:
-    """Return the mean over drives at each threshold; where a drive has no value it counts as 0."""
+    """Return the mean over drives at each threshold; a drive without a value counts as 0."""
     names = (*EXACT, *TOLERANT)
     values = {name: np.mean([np.nan_to_num(getattr(one, name)) for one in curves], axis=0) for name in names}
     return PrecisionRecall(curves[0].threshold, **values)

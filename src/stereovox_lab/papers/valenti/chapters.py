@@ -105,7 +105,7 @@ def points_sheet(maps: Sequence[Apart], kind: str, missing: str) -> Sheet:
 
 
 def probabilities_sheet(maps: Sequence[Apart]) -> Sheet:
-    """Return the measures that ask no threshold, for both kinds of truth, over the part that is scored."""
+    """Return the threshold-free measures, for both kinds of truth, over the scored part."""
     names = ("error", "corr., all cells", "corr., observed", "ECE", "share observed")
     heads = ("cell, range", "mapper", *(f"{kind}: {name}" for kind in KINDS for name in names))
     rows = []
@@ -121,7 +121,7 @@ def probabilities_sheet(maps: Sequence[Apart]) -> Sheet:
 
 
 def thresholds_sheet(maps: Sequence[Apart]) -> Sheet:
-    """Return precision and recall within one cell at several thresholds, over the part that is scored."""
+    """Return precision and recall within one cell at several thresholds, over the scored part."""
     listed = [figures(one.scored[CLAIMED])["listed"] for one in maps]
     heads = ("cell, range", "mapper", *(f"p > {point['threshold']:g}" for point in listed[0]))
     rows = [
@@ -132,7 +132,7 @@ def thresholds_sheet(maps: Sequence[Apart]) -> Sheet:
 
 
 def targets_sheet(maps: Sequence[Apart]) -> Sheet:
-    """Return what each map reaches of the targets, also if nothing is claimed."""
+    """Return each map's figures for the targets, even if nothing is claimed."""
     found = {(one.judged.setting, one.judged.mapper): one for one in maps}
     rows, heads = [], ()
     for (setting, mapper), kind in product(found, KINDS):
@@ -157,14 +157,14 @@ def row_of(values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 
 
 def text_of(value: float | None) -> str:
-    """Return a number for a table: whole ones with commas, others with three digits."""
+    """Return a number for a table: integers with commas, others with three digits."""
     if value is None:
         return "-"
     return f"{value:,}" if isinstance(value, int) else f"{value:.3f}"
 
 
 def tolerances_png(maps: Sequence[Apart]) -> bytes:
-    """Return precision against recall within one cell: a row a range, a column a cell size, a line a map."""
+    """Return precision against recall within one cell: a row per range, a column per cell size, a line per map."""
     return _charts(maps, _tolerance, ("recall within one cell", "precision within one cell"))
 
 
@@ -214,7 +214,7 @@ def _reliability(axis: Any, one: Apart) -> None:
 
 
 def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> Chapter:
-    """Return Table 8.1 next to the same of all drives at one setting. missing: why there is no OctoMap."""
+    """Return Table 8.1 next to our rows of all drives at one setting. missing: why there is no OctoMap."""
     shown = [one for one in judged if one.setting == setting]
     rows = [(f"{one.drive}, {one.mapper}", *row_of(vars(one.scores[CLAIMED]), TABLE)) for one in shown]
     thesis = [(f"thesis, {row.sequence}", *row_of(vars(row), TABLE)) for row in PRINTED]
@@ -235,7 +235,7 @@ def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> C
 
 
 def drive_chapter(maps: Sequence[Apart], counts: Mapping[str, Any], missing: str) -> Chapter:
-    """Return all about one drive. counts: what became of the lidar's points, by setting; missing: as above."""
+    """Return the chapter on one drive. counts: use of the lidar's points, by setting; missing: as above."""
     judged = [one.judged for one in maps]
     name, frames = judged[0].drive, max(one.frames for one in judged)
     sheets = [points_sheet(maps, kind, missing) for kind in KINDS]
@@ -257,7 +257,7 @@ def drive_chapter(maps: Sequence[Apart], counts: Mapping[str, Any], missing: str
 
 
 def speed_chapter(speeds: Sequence[Speed]) -> Chapter:
-    """Return how fast it is."""
+    """Return the chapter on speed."""
     parts = ("read", "match", "prepare", "map")
     rows = [
         (one.profile, one.image, one.frames, one.cores, f"{one.hertz:.1f}",

@@ -17,7 +17,7 @@ from stereovox_lab.papers.valenti.speed import Speed
 
 TARGET_RANGE = 20.0
 ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
-"""Most mean squared error, most calibration error, and least frames a second."""
+"""Largest mean squared error, largest calibration error, and least frames a second."""
 NOT_INSTALLED = "octomap-python is not installed"
 KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
 """Kinds of truth."""
@@ -42,7 +42,7 @@ TARGETS = {0.5: Target(0.92, 0.95, 0.72), 0.4: Target(0.90, 0.94, 0.70), 0.2: Ta
 
 
 class Result(NamedTuple):
-    """One target, and what a map reached of it; holds: None if it cannot be judged, unjudged: why not."""
+    """One target, and a map's figure for it; holds: None if it cannot be judged; unjudged: why not."""
 
     letter: str
     text: str
@@ -74,9 +74,9 @@ def speed_claim(speed: Speed) -> Claim:
 
 
 def results(found: Found, setting: Setting, mapper: str, kind: str) -> list[Result]:
-    """Return what one map reaches of the targets for its cell size, (a) to (e), against one kind of truth.
+    """Return one map's results on the targets for its cell size, (a) to (e), against one kind of truth.
 
-    Thresholds are chosen apart from where they are scored, see `Apart`.
+    Thresholds are chosen and scored on different parts, see `Apart`.
     """
     ours, target = found[setting, mapper], TARGETS[setting.voxel_size]
     scores, (precision, recall, correlation) = ours.scored[kind], target
@@ -101,7 +101,7 @@ def _at_least(letter: str, text: str, value: float | None, goal: float, why: str
 
 
 def _against_octomap(ours: Apart, octomap: Apart | None, kind: str) -> Result:
-    """Return (a): OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7, at once."""
+    """Return (a): both OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7."""
     text = "exact precision and recall, at one threshold"
     if octomap is None:
         return Result("a", text, "OctoMap's", "-", None, NOT_INSTALLED)
@@ -142,7 +142,7 @@ def _wins(found: Found, setting: Setting, rival: str) -> Claim:
 
 
 def _lesser(names: tuple[str, str]) -> Callable[[Apart], float]:
-    """Return a function that tells the lesser of precision and recall at the threshold that balances them elsewhere."""
+    """Return a function for the lesser of precision and recall at the threshold that balances them elsewhere."""
 
     def measure(one: Apart) -> float:
         point = one.point(CLAIMED, names) or {}
@@ -152,7 +152,7 @@ def _lesser(names: tuple[str, str]) -> Callable[[Apart], float]:
 
 
 def _score(tell: Callable[[Scores], float | None], otherwise: float) -> Callable[[Apart], float]:
-    """Return a function that tells a measure which asks no threshold; otherwise: where it has no value."""
+    """Return a function for a threshold-free measure; otherwise: its default if there is no value."""
 
     def measure(one: Apart) -> float:
         value = tell(one.scored[CLAIMED])
@@ -169,7 +169,7 @@ MEASURES: dict[str, Callable[[Apart], float]] = {
     "correlation, all cells": _score(lambda scores: scores.correlation, -1.0),
     "calibration error": _score(lambda scores: scores.ece, 1.0),
 }
-"""What is compared in (f)."""
+"""Measures compared in (f)."""
 
 
 def _format_point(point: Mapping[str, float | None], names: tuple[str, str]) -> str:

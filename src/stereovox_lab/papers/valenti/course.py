@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How measures go along a drive, frame by frame (Valenti 2018, Fig 8.4), and what the thesis says of it."""
+"""Course of measures along a drive, frame by frame (Valenti 2018, Fig 8.4), against the thesis."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RISES, LEVEL, FRAMES = 0.9, 0.05, 8
 
 
 def course_claims(judged: Sequence[Judged]) -> list[Claim]:
-    """Return what holds of Fig 8.4 for the maps of the thesis's profile that were scored after every frame."""
+    """Return the claims on Fig 8.4 for maps of the thesis's profile that were scored after every frame."""
     return [
         claim
         for one in judged

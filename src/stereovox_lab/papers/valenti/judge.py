@@ -25,14 +25,14 @@ from stereovox_lab.papers.valenti.street import halves
 TOLERANCE = 1
 """Cells."""
 Halves = Mapping[str, tuple[TruthCells, TruthCells]]
-"""By the kind of truth: that at the first and at the second half of a way."""
+"""By the kind of truth: its parts at the first and second half of a path."""
 
 
 @dataclass
 class ScoreSeries:
     """Scores a map after each frame against one truth, the same for all frames.
 
-    truth: the truth, made ready once. threshold: as in `score`. frames, scores: what was added so far.
+    truth: the truth, prepared once. threshold: as in `score`. frames, scores: entries so far.
     """
 
     truth: TruthCells
@@ -41,7 +41,7 @@ class ScoreSeries:
     scores: list[QuickScores] = field(default_factory=list)
 
     def add(self, frame: int, voxel_map: VoxelMap) -> QuickScores:
-        """Score `voxel_map` as it is after frame number `frame`, and remember it."""
+        """Score `voxel_map` as of frame number `frame`, and record it."""
         result = score_reading(self.truth.read(voxel_map), self.truth, self.threshold)
         self.frames.append(frame)
         self.scores.append(result)
@@ -50,7 +50,7 @@ class ScoreSeries:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return `frame` (F,) int64 and each measure by name (F,) float64, NaN where it has no value.
 
-        Those over observed cells alone begin with `observed_`.
+        Names of measures over observed cells alone begin with `observed_`.
         """
         rows = [_flat(score) for score in self.scores]
         columns = {name: np.array([row[name] for row in rows], float) for name in (rows[0] if rows else ())}
@@ -67,10 +67,9 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
 class Judged:
     """One map of one drive. scores: by the kind of truth, `view` and `rays`, see `lidar_truth`.
 
-    halves: likewise those of the street's first and second half; None if they were not asked for, or where the way
-    is too short.
+    halves: likewise for the street's first and second half; None if not requested, or if the path is too short.
     series: measures against the frame, truth `view` (Valenti 2018, Fig 8.4), and shown: cells for a picture; both None
-    if they were not asked for.
+    if not requested.
     """
 
     drive: str
@@ -106,7 +105,7 @@ def judge(
 ) -> tuple[list[Judged], dict[str, Any]]:
     """Return the result of each mapper, and the counts of the lidar's points.
 
-    numbers: frames of the drive; matched: the same as depth images, by profile. every_frame: also score each map after
+    numbers: frames of the drive; matched: their depth images, by profile. every_frame: also score each map after
     every frame. halved: also score both halves of the street. step: called after each frame of each pass: one pass for
     each kind of truth and each profile.
     """
@@ -146,7 +145,7 @@ def _truths(
 
 
 def _way(drive: Drive, numbers: Sequence[int]) -> NDArray[np.float64]:
-    """Return where the camera was (F, 3), frames without a pose left out."""
+    """Return the camera positions (F, 3) of frames with a pose."""
     way = []
     for i in numbers:
         with suppress(FrameRefused):
@@ -155,7 +154,7 @@ def _way(drive: Drive, numbers: Sequence[int]) -> NDArray[np.float64]:
 
 
 def _halves(truths: Mapping[str, TruthCells], way: NDArray[np.float64]) -> Halves | None:
-    """Return each truth at the first and at the second half of the way; None if one of them has no surface."""
+    """Return each truth at the first and second half of the path; None if one of them has no surface."""
     found = {}
     for kind, truth in truths.items():
         parts = halves(way, truth.centers())

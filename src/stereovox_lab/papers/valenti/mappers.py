@@ -32,10 +32,10 @@ MAPPERS = {THESIS: THESIS, DEFAULT: DEFAULT, OCTOMAP: DEFAULT}
 
 
 class Matched:
-    """The frames of a drive as depth images, for as many passes as one likes; refused pairs are left out.
+    """The frames of a drive as depth images, for any number of passes; refused pairs are left out.
 
-    numbers: which frames. config: how pairs are matched. room: bytes that may be kept from one pass to the next; a
-    recording that needs more is matched anew in each pass.
+    numbers: of the frames. config: matching settings. room: bytes that may be kept between passes; a
+    recording that needs more is matched again in each pass.
     """
 
     def __init__(self, drive: Drive, numbers: Sequence[int], config: Config, room: float = 1e9):
@@ -79,11 +79,11 @@ class Contestant(Protocol):
     """A mapper under test."""
 
     def add(self, frame: Frame) -> None:
-        """Take a frame in."""
+        """Add a frame."""
         ...
 
     def map(self) -> VoxelMap:
-        """Return the map as it is now."""
+        """Return the current map."""
         ...
 
 
@@ -99,7 +99,7 @@ def config_of(profile: str, setting: Setting, **more: object) -> Config:
 
 
 def why_missing(name: str) -> str:
-    """Return how to install the library of this mapper, '' where it is there."""
+    """Return how to install the library of this mapper, '' if it is installed."""
     try:
         make_contestant(name, Setting(0.5, 20.0))
     except MissingExtra as error:
@@ -119,10 +119,10 @@ class _Ours:
 
 
 class OctomapContestant(OctomapPython):
-    """OctoMap with its own settings; a pixel beyond the range clears its ray up to the range, as with us.
+    """OctoMap with its own settings; a pixel beyond the range clears its ray up to the range, as in ours.
 
-    Its range is a distance, ours a depth: what lies between the two, at the image's corners, is marked occupied without
-    a ray to it, so that it is not lost. Points that share a cell become one ray.
+    Its range is a distance, ours a depth: points between the two, at the image's corners, are marked occupied without
+    a ray to them, so that they are not lost. Points that share a cell become one ray.
     """
 
     def __init__(self, setting: Setting):
@@ -130,7 +130,7 @@ class OctomapContestant(OctomapPython):
         self._setting = setting
 
     def add(self, frame: Frame) -> None:
-        """Take in all points of a frame: in range as hits, beyond it to clear the way there."""
+        """Add all points of a frame: in range as hits, beyond it to clear space up to the range."""
         size, reach = self._setting
         depth = np.asarray(frame.depth, float) * frame.depth_scale
         if frame.reason is not None:  # nearly parallel rays: some point far beyond the range

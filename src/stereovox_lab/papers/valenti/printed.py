@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Valenti 2018, Table 8.1, as printed, and what is judged of each figure by rules that were set beforehand.
+"""Valenti 2018, Table 8.1, as printed, and the verdict on each figure by rules set beforehand.
 
 Own counts: a rate fits the four counts of its row to the last printed digit, rounded or cut off. Ours: at one setting,
 over a whole drive, at p > 0.7, the profile `valenti2018` is no worse than the row of the same sequence, and on any
@@ -19,10 +19,10 @@ from stereovox_lab.papers.valenti.mappers import DEFAULT, THESIS
 TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
 RATES = TABLE[4:]
 COUNTED = TABLE[4:9]
-"""Figures that the four counts of a row tell, too."""
+"""Figures that also follow from the four counts of a row."""
 LAST_DIGIT = 1e-3
 SEQUENCE = "kitti_tracking_"
-"""What the name of a drive begins with that is a sequence of the KITTI tracking data."""
+"""Prefix of the names of drives from the KITTI tracking data."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,16 @@ PRINTED = (
 recall with 37727 true positives, so one digit of 32727 seems to be wrong."""
 WORST = {name: (max if name == "error" else min)(getattr(row, name) for row in PRINTED) for name in RATES}
 BEST = {name: (min if name == "error" else max)(getattr(row, name) for row in PRINTED) for name in RATES}
-"""Of the ten rows."""
+"""Best figures of the ten rows."""
 
 
 def counted(row: PrintedRow) -> dict[str, float | None]:
-    """Return the rates that a row's counts give."""
+    """Return the rates that follow from a row's counts."""
     return Confusion(row.tp, row.fp, row.tn, row.fn).rates()
 
 
 def misprints() -> dict[tuple[str, str], float]:
-    """Return sequence and name of each printed rate that its row's counts contradict, with what they give."""
+    """Return sequence and name of each printed rate that its row's counts contradict, with their value."""
     found = {}
     for row in PRINTED:
         for name, value in counted(row).items():
@@ -78,23 +78,23 @@ def misprints() -> dict[tuple[str, str], float]:
 
 
 def row_of_drive(drive: str) -> PrintedRow | None:
-    """Return the printed row of a drive, None if the table has none of it."""
+    """Return the printed row of a drive, None if the table has none."""
     rows = {SEQUENCE + row.sequence: row for row in PRINTED}
     return rows.get(drive)
 
 
 def no_worse(name: str, ours: float, printed: float) -> bool:
-    """Tell whether a figure is no worse than the printed one, to half of its last digit."""
+    """Return whether a figure is no worse than the printed one, to half of its last digit."""
     return (printed - ours if name != "error" else ours - printed) <= LAST_DIGIT / 2
 
 
 def better(name: str, ours: float, printed: float) -> bool:
-    """Tell whether a figure is better than the printed one."""
+    """Return whether a figure is better than the printed one."""
     return ours < printed if name == "error" else ours > printed
 
 
 def own_claims() -> list[Claim]:
-    """Return, for each kind of figure, whether the printed ones agree with the counts next to them."""
+    """Return, for each kind of figure, whether the printed ones agree with their row's counts."""
     off = misprints()
     claims = []
     for name in COUNTED:
@@ -106,7 +106,7 @@ def own_claims() -> list[Claim]:
 
 
 def drive_claims(judged: Iterable[Judged], kind: str) -> list[Claim]:
-    """Return what holds of each figure on each drive; judged: at one setting. kind: of truth."""
+    """Return the claims on each figure of each drive; judged: at one setting. kind: of truth."""
     claims = []
     for one in judged:
         if one.mapper in (THESIS, DEFAULT):
@@ -115,7 +115,7 @@ def drive_claims(judged: Iterable[Judged], kind: str) -> list[Claim]:
 
 
 def absent_claims(drives: Iterable[str]) -> list[Claim]:
-    """Return what cannot be judged: sequences that are not at hand, and counts."""
+    """Return the claims that cannot be judged: missing sequences, and counts."""
     there = {row.sequence for drive in drives if (row := row_of_drive(drive))}
     absent = [row.sequence for row in PRINTED if row.sequence not in there]
     claims = [Claim("tp, fp, tn, fn of the ten rows", "as printed", "-", None,
@@ -127,7 +127,7 @@ def absent_claims(drives: Iterable[str]) -> list[Claim]:
 
 
 def judged_rows(judged: Sequence[Judged], kind: str) -> list[tuple[str, ...]]:
-    """Return the printed rows as text, each figure with its verdict: own counts, and ours where it is at hand."""
+    """Return the printed rows as text, each figure with its verdict: own counts, and ours if available."""
     off = misprints()
     ours = {one.drive: one.scores[kind] for one in judged if one.mapper == THESIS}
     rows = []

@@ -31,7 +31,7 @@ def find_drives(data: str | Path) -> list[Drive]:
     """Return all recordings at or below the folder `data` that have a lidar, in the order of their paths.
 
     data: a drive of KITTI raw data, a sequence of KITTI tracking (`training/image_02/0000`), or any folder above them.
-    Raises SourceError, one line: no such folder, no recording in it, one that cannot be used, none with lidar.
+    Raises SourceError, one line: no such folder, no recording in it, an unusable one, none with lidar.
     """
     if not os.path.isdir(data):
         raise SourceError(f"{data}: no such folder; give a drive of KITTI raw data or a folder with training/image_02")
@@ -45,7 +45,7 @@ def find_drives(data: str | Path) -> list[Drive]:
 
 
 def _places(folder: Path) -> Iterator[Path]:
-    """Yield the recordings at or below `folder`; what is one itself holds no other."""
+    """Yield the recordings at or below `folder`; a recording contains no other."""
     where = os.fspath(folder)
     if KittiTracking.recognises(where):
         if folder.resolve().parent.name == LEFT:

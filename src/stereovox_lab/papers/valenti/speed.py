@@ -19,14 +19,15 @@ from stereovox_lab.papers.valenti.recordings import Drive
 
 THREADS = 2
 MAX_FRAMES = 100
-"""Frames are enough."""
+"""Most frames timed."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a profile maps a drive, image files to updated map, files read ahead by a thread of their own.
+    """Speed of a profile on a drive, from image files to updated map, with files read ahead by their own thread.
 
-    hertz: frames a second over all; ms: median and further percentiles of each part, reading runs next to the others.
+    hertz: frames a second over all; ms: median and further percentiles of each part, reading runs in parallel with the
+    others.
     cores: processors this process may use.
     """
 
@@ -66,7 +67,7 @@ def time_mapping(
 def _map_all(
     drive: Drive, numbers: Sequence[int], config: Config, step: Callable[[], None]
 ) -> tuple[float, list[float], list[UpdateReport]]:
-    """Return the seconds for all frames, the milliseconds to read each, and what the mapper told of each."""
+    """Return the seconds for all frames, the milliseconds to read each, and the mapper's report of each."""
     mapper, reading, reports = Mapper(config), [], []
 
     def read(n: int) -> StereoFrame:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A street cut in two along the way of the car."""
+"""A street cut in two along the path of the car."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 GAP_M = 2.0
-"""Metres that the two halves of a street keep from each other, at least."""
+"""Least distance in metres between the two halves of a street."""
 
 
 def halves(way: NDArray[np.floating], points: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which points (N, 3) lie at the first half of a way (F, 3), and which at the second, by its length.
+    """Return which points (N, 3) are at the first half of a path (F, 3), and which at the second, by its length.
 
-    A point belongs to a half if that is nearer by more than GAP_M metres than the other one; so any two points of
+    A point belongs to a half that is nearer by more than GAP_M metres than the other; so any two points of
     different halves are more than GAP_M apart (the difference of two distances changes by at most twice a step).
     """
     from scipy.spatial import KDTree

@@ -5,21 +5,27 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import os
 import resource
 import signal
 from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from time import monotonic
+from time import monotonic, process_time
 from typing import Any
 
 from frames import BATCH, Tally, run, warm_up, without
 
-HUNG_S = 60.0
-"""Seconds after which a call that has not come back never will."""
+HUNG_S, STUCK_S = 60.0, 900.0
+"""Seconds of processor time, and by the clock, after which a call that has not come back never will.
+
+By the clock alone, a call on a busy machine would count as one that hangs. A call that waits forever uses no processor
+time.
+"""
 MEMORY = 4 << 30
 """Bytes that a batch may take."""
+NEVER = (float("inf"), float("inf"))
 LOOKS_S = 1.0
 PR_SET_PDEATHSIG = 1
 
@@ -36,7 +42,7 @@ class Watched:
         self._known: set[str] = set()
         self._seed, self._words, self._told = seed, list(words), told
         self._context = get_context("spawn")  # forked threads of the kernels would hang
-        self._number, self._since = self._context.Value("q", 0), self._context.Value("d", 0.0)
+        self._number, self._since = self._context.Value("q", 0), self._context.Array("d", 2)
 
     def run(self, frames: int, seconds: float) -> Tally:
         """Return what was seen."""
@@ -49,7 +55,7 @@ class Watched:
         """Run batches in a new process for as long as it lives; return the number of the next one."""
         mine, theirs = self._context.Pipe()
         task = self._seed, self._words, batch, frames, until
-        self._since.value = float("inf")  # until the first call
+        self._since[:] = NEVER  # until the first call
         process = self._context.Process(target=_work, args=(theirs, self._number, self._since, *task), daemon=True)
         process.start()
         theirs.close()
@@ -61,8 +67,8 @@ class Watched:
                     self.memory = {"memory_mb": [*self.memory.get("memory_mb", [megabytes])[:1], megabytes]}
                     self._tell(batch, seen, tally, megabytes)
                     batch += 1
-                elif monotonic() - self._since.value > HUNG_S:
-                    return self._lost(tally.hung, batch, f"no answer for {HUNG_S:.0f} s")
+                elif self._hangs(process.pid):
+                    return self._lost(tally.hung, batch, f"no answer for {HUNG_S:.0f} s of work or {STUCK_S:.0f} s")
         except EOFError:  # it is over, or it died
             process.join()
             if process.exitcode:
@@ -71,6 +77,11 @@ class Watched:
         finally:
             process.kill()
             process.join()
+
+    def _hangs(self, pid: int | None) -> bool:
+        """Return whether the call that process `pid` is in has worked, or waited, for too long."""
+        since, worked = self._since[:]
+        return monotonic() - since > STUCK_S or _processor_s(pid) - worked > HUNG_S
 
     def _lost(self, lines: list[str], batch: int, what: str) -> int:
         lines.append(f"[{self._seed}, {batch}], frame {self._number.value}: {what}")
@@ -99,15 +110,24 @@ def _work(
     kinds, odd = without(words)
 
     def alive(now: int) -> bool:
-        number.value, since.value = now, monotonic()
+        number.value, since[:] = now, (monotonic(), process_time())
         return now % 100 > 0 or monotonic() < until
 
     warm_up([seed, batch, 0], kinds, odd, alive)
     while batch * BATCH < frames and monotonic() < until:
         seen = run(min(BATCH, frames - batch * BATCH), [seed, batch], 0, kinds, odd, alive)
-        since.value = float("inf")
+        since[:] = NEVER
         tell.send((seen, _megabytes()))
         batch += 1
+
+
+def _processor_s(pid: int | None) -> float:
+    """Return the seconds of processor time that a process took, 0 if it has ended."""
+    try:
+        user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    except (OSError, ValueError):
+        return 0.0
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def _megabytes() -> float:

@@ -3,31 +3,21 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from errno import ENOSPC
 from shutil import rmtree
 
 import numpy as np
 import pytest
+from full_disks import full_disk
 from made_maps import random_map
 
 from stereovox.cli import main
 
-resource = pytest.importorskip("resource", reason="this system limits no file sizes")
+pytest.importorskip("resource", reason="this system limits no file sizes")
 
 MOST = 1500
 """Bytes of the largest file that can be written."""
 POINTS = np.random.default_rng(0).uniform(0, 4, (3000, 3))
-
-
-@contextmanager
-def full_disk():
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +52,13 @@ def test_nothing_is_left_half_written(words, out, maps, tmp_path, capsys, monkey
     assert main(words) in (0, 3)  # compiles and saves kernels as well
     whole = files_in(tmp_path)
     assert whole
-    with full_disk():
+    with full_disk(MOST):
         main(words)
     assert files_in(tmp_path) == whole
     for path in tmp_path.iterdir():
         rmtree(path) if path.is_dir() else path.unlink()
     capsys.readouterr()
-    with full_disk():
+    with full_disk(MOST):
         assert main(words) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert str(tmp_path / out) in said

@@ -110,15 +110,16 @@ def test_frames_are_of_all_kinds():
 
 
 def test_a_process_that_hangs_or_dies_is_seen_and_replaced(monkeypatch):
-    """Batch 0 is well, 1 hangs, 2 dies, 3 is well."""
+    """Batch 1 waits forever, 2 dies, 4 works forever; 0, 3 and 5 are well."""
     monkeypatch.setattr(watched, "HUNG_S", 1.0)
+    monkeypatch.setattr(watched, "STUCK_S", 2.0)
     monkeypatch.setattr(watched, "LOOKS_S", 0.1)
     monkeypatch.setattr(watched, "_work", lost_batches.work)
     lines = []
     found = watched.Watched(6, [], lines.append)
-    tally = found.run(4 * fuzz.BATCH, 60.0)
-    assert dict(tally.frames) == {"Frame": 2}
-    assert tally.hung == ["[6, 1], frame 17: no answer for 1 s"]
+    tally = found.run(6 * fuzz.BATCH, 600.0)
+    assert dict(tally.frames) == {"Frame": 3}
+    assert tally.hung == [f"[6, {batch}], frame 17: no answer for 1 s of work or 2 s" for batch in (1, 4)]
     assert tally.bad == ["[6, 2], frame 17: the process ended with 5"]
     assert found.memory == {"memory_mb": [1.0, 1.0]}
     assert tally.failed

@@ -17,6 +17,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from full_disks import full_disk
 from llvmlite.binding import get_host_cpu_features as host_features
 from packaging.requirements import Requirement
 
@@ -114,6 +115,28 @@ def test_kernels_run_where_nothing_can_be_written(monkeypatch):
     assert double.stats.cache_path is None
 
 
+def test_kernels_run_on_a_full_disk(monkeypatch, tmp_path):
+    monkeypatch.setattr(_jit, "cache_folder", lambda: tmp_path)
+    double, half = _jit.kernel(_double), _jit.kernel(_half)
+    assert half(4.0) == 2
+    saved = sorted(tmp_path.rglob("*"))
+    assert saved
+    with full_disk(100):
+        assert double(4) == 8
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.suffix in (".nbc", ".nbi")] == [
+        path for path in saved if path.suffix in (".nbc", ".nbi")
+    ]
+    assert double(4.0) == 8  # compiled, and saved, once there is room
+
+
+def _double(x):
+    return 2 * x
+
+
+def _half(x):
+    return x / 2
+
+
 def test_the_cache_is_looked_for_in_this_order(monkeypatch, tmp_path, a_file):
     def found():
         return fresh_cache_folder().relative_to(tmp_path).parts[0]
@@ -201,6 +224,7 @@ def assembly(kernel):
 
 
 PRIVATE = {
+    "numba.core.caching": ("FunctionCache.save_overload",),
     "numba.core.config": ("CACHE_DIR",),
     "numba.core.compiler": ("CompilerBase.define_pipelines", "DefaultPassBuilder.define_nopython_pipeline"),
     "numba.core.compiler_machinery": ("register_pass", "PassManager.finalize"),

@@ -11,6 +11,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -106,9 +107,25 @@ def with_cache(compile_it: Callable[[bool], Function]) -> Function:
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder or "")
     try:
-        return compile_it(folder is not None)
+        compiled = compile_it(folder is not None)
     finally:
         settings.CACHE_DIR = before
+    if folder is not None:
+        _run_if_not_saved(compiled)
+    return compiled
+
+
+def _run_if_not_saved(compiled: Any) -> None:
+    """Let a kernel run although its machine code cannot be saved, because the disk is full for example."""
+    cache = getattr(compiled, "_cache", None)  # the simulator of graphics cards has none
+    if cache is not None:
+        save = cache.save_overload
+
+        def save_overload(*overload: Any) -> None:
+            with suppress(OSError):
+                save(*overload)
+
+        cache.save_overload = save_overload
 
 
 def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **options: Any) -> Function:

@@ -3,7 +3,6 @@
 
 import errno
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disks import full_disk
 from made_faults import disk, in_child, small_map
 
 from stereovox.config import load_config
@@ -135,15 +135,8 @@ def test_data_is_on_the_disk_before_the_manifest_names_it(tmp_path, monkeypatch)
 def test_files_that_may_not_grow_leave_the_older_map(tmp_path, room):
     small_map(1).save(tmp_path / "m")
     whole = names(tmp_path / "m")
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
-    try:
-        with pytest.raises(MapFileError, match="File too large"):
-            small_map(2).save(tmp_path / "m")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
-        signal.signal(signal.SIGXFSZ, before)
+    with full_disk(room), pytest.raises(MapFileError, match="File too large"):
+        small_map(2).save(tmp_path / "m")
     assert names(tmp_path / "m") == whole
     assert load_map(tmp_path / "m").frames == 1
 

@@ -33,6 +33,9 @@ COMMANDS = """# Commands
 
 - `stereovox --help` lists all commands, `stereovox map --help` the options of one.
 - Options come after the command, and are written in full. A value that begins with a minus needs `=`: `--up=-y`.
+- Tab completes commands and options after `pip install 'stereovox[complete]'` and, in `.bashrc` or `.zshrc`,
+  `eval "$(register-python-argcomplete stereovox)"`; in fish
+  `register-python-argcomplete --shell fish stereovox | source`.
 - Text and progress go to stderr. With `--json`, which every command has, the last line of stdout is one JSON object.
 - Exit status: 0 for success; 2 for bad usage or bad input, with one line that names the file or value and the remedy;
   3 for a map that was written but may be wrong ([self-check](../robots.md#self-check)) or holds less than half of what
@@ -133,7 +136,7 @@ def _commands() -> str:
     overview = [f"| [`{name}`](#{name}) | {_cell(_first(module.__doc__))} |" for name, module in modules.items()]
     parts = [COMMANDS.format(source=SOURCE.format("src/stereovox/cli"), overview="\n".join(overview))]
     for name, module in modules.items():
-        parser = cli._Parser(prog=f"stereovox {name}", description=module.__doc__, epilog=f"example: {module.EXAMPLE}")
+        parser = cli._Parser(prog=f"stereovox {name}", description=module.__doc__, examples=module.EXAMPLES)
         module.add_arguments(parser)
         parts.append(_command(name, parser, "##"))
     return "\n".join(parts)
@@ -147,7 +150,7 @@ def _command(name: str, parser: ArgumentParser, heading: str) -> str:
     if options:
         lines += ["```text", _usage(parser.prog, options), "```", "", "| argument | default | |", "|---|---|---|"]
         lines += [f"| `{_name(action)}` | {_default(action)} | {_help(parser, action)} |" for action in options]
-        lines += ["", "```bash", str(parser.epilog).removeprefix("example: "), "```", ""]
+        lines += ["", "```bash", *parser.examples.splitlines(), "```", ""]
     for action in kinds:
         lines += [_command(f"{name} {kind}", sub, heading + "#") for kind, sub in action.choices.items()]
     return "\n".join(lines)

@@ -21,7 +21,7 @@ import numpy as np
 import stereovox as sv
 from stereovox.opening import Source
 
-EXAMPLE = "stereovox greet"
+EXAMPLES = "stereovox greet"
 GROUP = "Ask"
 
 

@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from made_recordings import write_png
 
 import stereovox as sv
 from stereovox import VoxelMap, load_config
-from stereovox.cli import COMMANDS, main
+from stereovox.cli import COMMANDS, _parse, command_module, commands, main
 from stereovox.mapper import Mapper
 
 
@@ -433,3 +434,43 @@ def test_a_map_without_an_occupied_cell_asks_for_the_range(recording, tmp_path, 
     unsure = ["--frames", ":1", "--set", "map.prior=0.001"]
     assert run(*common[:2], "--out", tmp_path / "unsure", "--voxel-size", 0.1, *unsure) == 0
     assert "are tentative; is --max-range large enough, map.prior too low?" in capsys.readouterr().err
+
+
+KINDS = ("wall", "noise", "pair", "stereo", "import")
+
+
+@pytest.mark.parametrize("name", [*commands(), *(f"calibrate.calibrate_{kind}" for kind in KINDS)])
+def test_examples_in_the_help_are_accepted(name, capsys):
+    module = import_module(f"stereovox.cli.{name}") if "." in name else command_module(name)
+    examples = module.EXAMPLES.splitlines()
+    words = [shlex.split(example)[1:] for example in examples]
+    assert len(examples) == len(set(examples)) == 2
+    assert {given[0] for given in words} == {name.partition(".")[0]}
+    for given in words:
+        _parse(given)
+    with pytest.raises(SystemExit):
+        _parse([*words[0][: 1 + ("." in name)], "--help"])
+    assert capsys.readouterr().out.splitlines()[-3:] == ["examples:", *(f"  {example}" for example in examples)]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("stereovox ma", {"map "}),
+        ("stereovox map --vox", {"--voxel-size "}),
+        ("stereovox calibrate st", {"stereo "}),
+        ("stereovox calibrate stereo --le", {"--lens "}),
+    ],
+)
+def test_the_shell_completes_commands_and_options(line, expected, tmp_path):
+    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    answer = {"_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "words"), "_ARGCOMPLETE_IFS": "\n"}
+    command = [sys.executable, "-c", "from stereovox.cli import main; main()"]
+    done = subprocess.run(command, env={**os.environ, **asked, **answer}, capture_output=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert set((tmp_path / "words").read_text().split("\n")) == expected
+
+
+def test_an_option_of_another_kind_of_command_is_refused_in_the_words_of_that_kind(capsys):
+    words = "calibrate stereo boards --board 9x6 --square 0.025 --out rig.toml --distance 3"
+    fails_with_one_line(capsys, "see: stereovox calibrate stereo --help", *words.split())

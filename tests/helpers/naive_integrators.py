@@ -285,7 +285,7 @@ def _look_up(table: SensorTable, z: NDArray, d: NDArray, config: Config) -> NDAr
     column = np.floor((t / REACH_SIGMA + 1) / 2 * COLUMNS)
     inside = np.clip(column, 0, COLUMNS - 1)
     evidence = table.log_odds[row, np.where(np.isfinite(inside), inside, 0).astype(int)]
-    evidence = np.where(column < 1, table.log_odds[:, 0].mean(), evidence)
+    evidence = np.where(column < 1, table.log_odds[0, 0], evidence)
     return np.where(d > 0, evidence, 0.0)
 
 

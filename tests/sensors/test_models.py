@@ -6,6 +6,7 @@ import pytest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import NoiseConfig, SensorConfig
 from stereovox.errors import ConfigError
+from stereovox.integrate.views import kernel_table
 from stereovox.sensors import SENSORS, make_sensor
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, offset_sigma, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
@@ -97,8 +98,33 @@ def test_point_models_mark_nothing_beside_the_hit(name):
 
 
 def test_stereo_clears_half_as_much_where_the_gaussian_is_half():
-    p = model_of("stereo", fade=1.5).probability(2.0 - 0.05 * (HALF + 1.5), 2.0, 0.05)
-    assert p == pytest.approx(0.35 + 0.15 * 0.5)
+    """Half of what the Gaussian has gained by the end of the table, where p_free is reached."""
+    lost = np.exp(-0.5 * (4 * 127 / 128 - 1.5) ** 2)
+    there = np.sqrt(-2 * np.log((1 + lost) / 2))
+    model = model_of("stereo", fade=1.5, p_free=0.35)
+    assert model.probability(2.0 - 0.05 * (there + 1.5), 2.0, 0.05) == pytest.approx(0.35 + 0.15 * 0.5)
+
+
+@pytest.mark.parametrize("fade", [0.1, 2.0, 3.9])
+def test_stereo_is_never_below_p_free_and_reaches_it(fade):
+    p = model_of("stereo", fade=fade).probability(3.0 - 0.05 * np.linspace(0, 14, 1000), 3.0, 0.05)
+    assert p.min() == p[-1] == pytest.approx(0.3716)
+    assert (np.diff(p) <= 0).all()
+
+
+def test_stereo_must_clear_within_its_table():
+    with pytest.raises(ConfigError, match=r"sensor\.fade 4: must be less than 3\.97"):
+        model_of("stereo", fade=4.0)
+
+
+@pytest.mark.parametrize("name", ["constant", "andert", "valenti", "stereo"])
+def test_far_before_a_measurement_the_table_says_exactly_p_free(name):
+    """Also where noise is so small, next to the camera, that four sigma before a measurement Andert's peak is large."""
+    model = model_of(name, p_free=0.3)
+    table = tabulate(model, RangeNoise(0, 0, 0.001), 10.0)
+    np.testing.assert_allclose(table.log_odds[:, 0], np.log(0.3 / 0.7), rtol=1e-12)
+    assert kernel_table(table, 10.0).free == round(1000 * np.log(0.3 / 0.7))
+
     assert model_of("constant").probability(2.0, 2.0, 0.05) == 0.7
 
 

@@ -37,8 +37,11 @@ def test_table_of_a_fisheye_with_much_noise():
     assert table.sigma[-1] > 0.4
     z = (len(table.sigma) - 0.5) * 10 / len(table.sigma)
     p = model.probability(z + offset_sigma() * table.sigma[-1], z, table.sigma[-1])
-    np.testing.assert_allclose(table.log_odds[-1, :-1], np.log(p / (1 - p))[:-1], atol=1e-9)
-    assert table.log_odds[-1, -1] == 0  # the table ends in nothing, whatever the model says there
+    np.testing.assert_allclose(table.log_odds[-1, 1:-1], np.log(p / (1 - p))[1:-1], atol=1e-9)
+    assert (
+        table.log_odds[-1, -1] == 0
+    )  # the table ends in nothing and begins with p_free, whatever the model says there
+    assert table.log_odds[-1, 0] == pytest.approx(np.log(0.3 / 0.7))
 
 
 def test_noise_of_both_wide_cameras():

@@ -32,9 +32,9 @@ GROUPS = {
 }
 """Groups of the help: the folder of their commands, and the commands.
 
-Each command is a module with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`; it may name
-its `GROUP`. The module of a command that is a Python keyword has a trailing underscore. Other packages add commands as
-entry points `name = "module"` of the group `stereovox.commands`.
+Each command is a module with a docstring, `EXAMPLES` (a line each), `add_arguments(parser)` and
+`run(arguments) -> dict`; it may name its `GROUP`. The module of a command that is a Python keyword has a trailing
+underscore. Other packages add commands as entry points `name = "module"` of the group `stereovox.commands`.
 """
 COMMANDS = {name: f"stereovox.cli.{folder}.{name}" for folder, names in GROUPS.values() for name in names}
 COMMANDS |= {"import": "stereovox.cli.map.import_", "calibrate": "stereovox.cli.calibrate"}
@@ -50,6 +50,8 @@ GLOBAL_OPTIONS = ("-h", "--help", "--version")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = sys.argv[1:] if argv is None else argv
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks how a line goes on
+        _complete(os.environ.get("COMP_LINE", "").split()[1:])
     try:
         _check_command(words)
         arguments = _parse(words)
@@ -89,8 +91,8 @@ def _fail(message: str, status: int, words: Sequence[str] = ()) -> int:
 class _Parser(argparse.ArgumentParser):
     """Argument parser that accepts full option names only and raises errors that `main` prints as one line."""
 
-    def __init__(self, **settings: Any):
-        self.options: list[str] = []
+    def __init__(self, examples: str = "", **settings: Any):
+        self.examples, self.options = examples, list[str]()
         self._words: Sequence[str] = ()
         super().__init__(**settings, allow_abbrev=False)
 
@@ -104,6 +106,10 @@ class _Parser(argparse.ArgumentParser):
         self._words = args or ()
         return super().parse_known_args(args, namespace)
 
+    def format_help(self) -> str:
+        lines = [f"  {line}\n" for line in self.examples.splitlines()]
+        return "".join([super().format_help(), *(["\nexamples:\n"] if lines else []), *lines])
+
     def error(self, message: str) -> NoReturn:
         raise StereovoxError(f"{message}{self._minus_hint(message)}; see: {self.prog} --help")
 
@@ -115,15 +121,36 @@ class _Parser(argparse.ArgumentParser):
                 return f" (write {option}={value})"
         return ""
 
-    def refuse(self, word: str) -> NoReturn:
+    def refuse(self, word: str, arguments: argparse.Namespace) -> NoReturn:
         """Raise the error for an argument that was not recognised."""
+        for action in self._actions:
+            if isinstance(action.choices, dict):
+                action.choices[getattr(arguments, action.dest)].refuse(word, arguments)
         option = word.partition("=")[0]
         if option.startswith("-"):
             self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options, '--')}")
         self.error(f"'{word}' is one argument too many")
 
 
+def _complete(words: Sequence[str]) -> None:
+    """Print the words that may come next, for the shell, and exit; do nothing if argcomplete is not installed."""
+    try:
+        from argcomplete import autocomplete
+    except ImportError:
+        return
+    autocomplete(_parser(words[:1] if len(words) > 1 and words[0] in commands() else ()))
+
+
 def _parse(words: Sequence[str]) -> argparse.Namespace:
+    parser = _parser(words)
+    arguments, left = parser.parse_known_args(words)
+    if left:
+        parser.refuse(left[0], arguments)
+    return arguments
+
+
+def _parser(words: Sequence[str]) -> _Parser:
+    """Return the parser of the command that `words` begin with, or of all commands."""
     parser = _Parser(prog="stereovox", description=stereovox.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
@@ -131,14 +158,11 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
     modules = {words[0]: command_module(words[0])} if one else _all_modules()
     for name, module in modules.items():
         about = str(module.__doc__).strip()
-        command = subparsers.add_parser(name, description=about, epilog=f"example: {module.EXAMPLE}")
+        command = subparsers.add_parser(name, description=about, examples=module.EXAMPLES)
         module.add_arguments(command)
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line of stdout")
     subparsers.help = _grouped(modules)
-    arguments, left = parser.parse_known_args(words)
-    if left:
-        subparsers.choices[arguments.command].refuse(left[0])
-    return arguments
+    return parser
 
 
 def _grouped(modules: Mapping[str, Any]) -> str:

@@ -140,8 +140,7 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> Ke
     """Return `table` as kernels read it; up to depth `blind` in metres nothing is cleared."""
     units = to_units(table.log_odds)
     clear, mark = np.minimum(units, 0), np.maximum(units, 0)
-    free = int(to_units(table.log_odds[:, 0].mean()))
-    clear[:, 0] = free
+    free = int(units[0, 0])
     reach = REACH_SIGMA * table.sigma
     edges = np.arange(len(reach)) / table.rows_per_metre
     safe = np.append(np.minimum.accumulate((edges - reach)[::-1])[::-1], max_range)

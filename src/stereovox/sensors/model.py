@@ -21,6 +21,8 @@ COLUMNS = 128
 REACH_SIGMA = 4.0
 """The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
 
+END_SIGMA = REACH_SIGMA * (1 - 1 / COLUMNS)
+"""Distance of the outermost columns from the measurement."""
 FAR_SIGMA = 12.0
 """Distance from a measurement at which a model must have reached p_free and p_unknown."""
 END_TOLERANCE = 0.02
@@ -68,7 +70,9 @@ class InverseSensorModel(Protocol):
 class SensorTable:
     """A tabulated sensor model.
 
-    log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0.
+    log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0. The
+    first column is looked up for everything farther before a measurement, and is p_free; the last for everything
+    farther behind, and is 0.
     hit: (ROWS,) log-odds of the cell that holds the measured point.
     passed: (ROWS,) least log-odds, at most 0, of a cell at the row's depth that is looked through.
     sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
@@ -100,11 +104,11 @@ def tabulate(
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
-    log_odds[:, -1] = 0  # looked up for everything farther behind, which gets no evidence
+    log_odds[:, 0], log_odds[:, -1] = _log_odds(model, np.array(model.p_free)), 0
     at = model.probability(z_measured, z_measured, sigma)
     width = sigma if pose_noise is None else np.hypot(sigma, pose_noise.sigma(z_measured))
     hit = _log_odds(model, model.hit(z_measured, width, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
-    passed = np.full(ROWS, log_odds[:, 0].mean())
+    passed = log_odds[:, 0].copy()
     if hasattr(model, "passed"):
         least = _log_odds(model, model.passed(z_measured, width, voxel_size))  # pyright: ignore
         passed = np.clip(least, passed, 0)

@@ -8,7 +8,8 @@ from math import erf, exp, pi, sqrt
 
 import numpy as np
 
-from stereovox.sensors.model import Array
+from stereovox.errors import ConfigError
+from stereovox.sensors.model import END_SIGMA, Array
 
 
 @dataclass(frozen=True)
@@ -16,9 +17,9 @@ class Stereo:
     """A model of stereo's range noise and of the size of cells.
 
     Within `fade` sigma of the range noise before the measured point there is no evidence; from there towards the camera
-    the evidence for free space grows as a Gaussian falls: a surface measured too far does not clear itself, nor does
-    a pole that the camera cannot separate from the wall behind it. Behind the point there is no evidence either, so
-    walls do not grow thick (the weakness of Valenti 2018, section 8.4).
+    the evidence for free space grows as a Gaussian falls, and is `p_free` from `END_SIGMA` on: a surface measured too
+    far does not clear itself, nor does a pole that the camera cannot separate from the wall behind it. Behind the point
+    there is no evidence either, so walls do not grow thick (the weakness of Valenti 2018, section 8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
     its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which
@@ -31,16 +32,22 @@ class Stereo:
     p_right: float = 0.95
     prior: float = 0.1
     trust: float = 0.8
-    p_free: float = 0.35
+    p_free: float = 0.3716
     p_unknown: float = 0.5
     p_least: float = 0.7
     fade: float = 2.0
     passes: float = 0.3
 
+    def __post_init__(self) -> None:
+        if not self.fade < END_SIGMA:
+            raise ConfigError(f"sensor.fade {self.fade:g}: must be less than {END_SIGMA:.2f}, where the table ends")
+
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
-        """Return p_free rising to p_unknown at `fade` sigma before the measurement."""
+        """Return p_free up to `END_SIGMA` before the measurement, rising to p_unknown at `fade` sigma before it."""
         t = np.minimum((np.asarray(z) - z_measured) / sigma + self.fade, 0.0)
-        before = self.p_free + (self.p_unknown - self.p_free) * np.exp(-0.5 * t * t)
+        end = exp(-0.5 * (END_SIGMA - self.fade) ** 2)
+        rise = (np.exp(-0.5 * t * t) - end) / (1 - end)
+        before = self.p_free + (self.p_unknown - self.p_free) * np.maximum(rise, 0)
         return np.where(t < 0, before, self.p_unknown)
 
     def hit(self, z_measured: Array, sigma: Array, voxel_size: float) -> Array:

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from stereovox_lab.bench.rows import Variant
 
 GROUP = "Prove"
-EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
+EXAMPLES = """stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap
+stereovox bench --peers octomap --json"""
 VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
 FAR = ("both", "unknown", "free")
 BUILT_IN = "sim:room?frames=60"

@@ -15,7 +15,8 @@ from typing import Any
 from stereovox.cli.terminal import command_line, progress_of_steps, say, say_about_compiling, say_table
 
 GROUP = "Prove"
-EXAMPLE = "stereovox benchmark recordings/kitchen --libraries stereovox,octomap --out kitchen-benchmark"
+EXAMPLES = """stereovox benchmark recordings/kitchen --libraries stereovox,octomap --out kitchen-benchmark
+stereovox benchmark sim:room --voxel-size 0.1 --out room-benchmark"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -13,7 +13,8 @@ from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling, 
 from stereovox.errors import StereovoxError
 
 GROUP = "Prove"
-EXAMPLE = "stereovox explore sim:room 'sim:hall?plan={seed}' --seeds 0:20 --out missions"
+EXAMPLES = """stereovox explore sim:room 'sim:hall?plan={seed}' --seeds 0:20 --out missions
+stereovox explore sim:room --mission middle --seeds 0:3 --out middle"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

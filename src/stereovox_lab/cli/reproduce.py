@@ -16,7 +16,8 @@ from typing import Any
 from stereovox.cli.terminal import progress_bar, say, say_about_compiling
 
 GROUP = "Prove"
-EXAMPLE = "stereovox reproduce chien2020 --out chien2020"
+EXAMPLES = """stereovox reproduce chien2020 --out chien2020
+stereovox reproduce valenti2018 --quick --out valenti2018"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

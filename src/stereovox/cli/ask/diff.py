@@ -15,7 +15,8 @@ from stereovox.cli.terminal import say, thousands
 if TYPE_CHECKING:
     from stereovox.products.difference import Difference
 
-EXAMPLE = "stereovox diff monday.svox tuesday.svox --picture changes.png"
+EXAMPLES = """stereovox diff monday.svox tuesday.svox --picture changes.png
+stereovox diff monday.svox tuesday.svox --json"""
 
 KINDS = {
     "appeared": "appeared: free in A, occupied in B",

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
     from stereovox.products.distance import DistanceField
 
-EXAMPLE = "stereovox distance kitchen.svox kitchen.npz --to unknown --max 2 --picture distance.png"
+EXAMPLES = """stereovox distance kitchen.svox kitchen.npz --to unknown --max 2 --picture distance.png
+stereovox distance kitchen.svox near.npz --box=-1,-1,0,1,1,2"""
 STATES = ("occupied", "tentative", "unknown")
 
 

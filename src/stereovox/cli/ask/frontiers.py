@@ -14,7 +14,8 @@ from stereovox.cli.terminal import say, thousands
 if TYPE_CHECKING:
     from stereovox.products.frontiers import Frontier
 
-EXAMPLE = "stereovox frontiers room.svox --heights 0.1:1.8 --picture frontiers.png"
+EXAMPLES = """stereovox frontiers room.svox --heights 0.1:1.8 --picture frontiers.png
+stereovox frontiers room.svox --json"""
 MAX_PRINTED = 12
 """Only the largest frontiers are printed."""
 

@@ -29,7 +29,8 @@ from stereovox.cli.terminal import (
 if TYPE_CHECKING:
     from stereovox.frame import UpdateReport
 
-EXAMPLE = "stereovox grid floor.bag --poses reference.yaml --out kinect.yaml"
+EXAMPLES = """stereovox grid floor.bag --poses reference.yaml --out kinect.yaml
+stereovox grid sim:floor --out floor.yaml"""
 MODES = ("trinary", "scale", "raw")
 
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
     from stereovox.products.floor.ground import Ground
 
-EXAMPLE = "stereovox ground room.svox ground.png --height 1.2 --max-step 0.05"
+EXAMPLES = """stereovox ground room.svox ground.png --height 1.2 --max-step 0.05
+stereovox ground room.svox ground.npz"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

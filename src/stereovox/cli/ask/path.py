@@ -21,7 +21,8 @@ from stereovox.cli.terminal import say
 if TYPE_CHECKING:
     from stereovox.products.path_check import PathCheck
 
-EXAMPLE = "stereovox path kitchen.svox 0,0,0 1,0,0 1,0.5,0 --radius 0.3"
+EXAMPLES = """stereovox path kitchen.svox 0,0,0 1,0,0 1,0.5,0 --radius 0.3
+stereovox path kitchen.svox 0,0,0 1,0,0 --radius 0.3 --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -12,24 +12,21 @@ from typing import Any
 
 KINDS = ("wall", "noise", "pair", "stereo", "import")
 """Each is a module `calibrate_*` of this package with the parts of a command."""
-EXAMPLE = "stereovox calibrate wall recordings/wall --distance 1.4 --out camera.toml"
+EXAMPLES = """stereovox calibrate wall recordings/wall --distance 1.4 --out camera.toml
+stereovox calibrate noise wall-1m wall-2m --out noise.toml"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the kinds of calibration and their options."""
     kinds = parser.add_subparsers(dest="kind", metavar="|".join(KINDS), required=True)
-    options: list[str] = getattr(parser, "options", [])  # candidates for "did you mean"
     for name in KINDS:
         module = _module(name)
         about = str(module.__doc__).strip()
-        kind = kinds.add_parser(
-            name, help=about.splitlines()[0], description=about, epilog=f"example: {module.EXAMPLE}"
-        )
+        kind = kinds.add_parser(name, help=about.splitlines()[0], description=about, examples=module.EXAMPLES)
         module.add_arguments(kind)
         kind.add_argument(
             "--json", action="store_true", default=SUPPRESS, help="print one JSON object as the last line of stdout"
         )
-        options += getattr(kind, "options", [])
 
 
 def run(arguments: Namespace) -> dict[str, Any]:

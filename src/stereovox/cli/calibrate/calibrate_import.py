@@ -18,7 +18,8 @@ from stereovox.cli.recordings import check_outputs
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
-EXAMPLE = "stereovox calibrate import camchain.yaml --out recordings/flight/rig.toml"
+EXAMPLES = """stereovox calibrate import camchain.yaml --out recordings/flight/rig.toml
+stereovox calibrate import calibration.yaml --out rig.toml --json"""
 
 MAX_BASELINE_M = 5.0
 """A longer baseline likely means a calibration in millimetres."""

@@ -18,7 +18,8 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.calibrate.noise import ConditionNoise, NoiseAt, NoiseCalibration
 
-EXAMPLE = "stereovox calibrate noise wall-1m wall-2m wall-4m --out my-d435.toml --report noise-report"
+EXAMPLES = """stereovox calibrate noise wall-1m wall-2m wall-4m --out my-d435.toml --report noise-report
+stereovox calibrate noise wall-2m --out my-d435.toml --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from stereovox.opening import DepthSource
     from stereovox.sources.rigs.pair_file import PairSettings
 
-EXAMPLE = "stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml"
+EXAMPLES = """stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml
+stereovox calibrate pair recordings/flight --out pair.toml --json"""
 UNCERTAIN = (0.5, 0.02)
 """Standard deviations (degrees, metres) above which the user is warned."""
 

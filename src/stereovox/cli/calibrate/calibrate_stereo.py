@@ -18,7 +18,8 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.calibrate.stereo import StereoCalibration
 
-EXAMPLE = "stereovox calibrate stereo boards --board 9x6 --square 0.025 --out rig.toml --report boards-report"
+EXAMPLES = """stereovox calibrate stereo boards --board 9x6 --square 0.025 --out rig.toml --report boards-report
+stereovox calibrate stereo boards --board 9x6 --square 0.025 --lens fisheye --out rig.toml"""
 GOOD_PX = 0.5
 MAX_BASELINE_M = 5.0
 """A longer baseline likely means a square given in millimetres."""

@@ -17,7 +17,8 @@ from stereovox.cli.terminal import say
 if TYPE_CHECKING:
     from stereovox.calibrate.wall import WallCalibration
 
-EXAMPLE = "stereovox calibrate wall near far --distance 1.4 --distance 3 --out camera.toml --report wall-report"
+EXAMPLES = """stereovox calibrate wall near far --distance 1.4 --distance 3 --out camera.toml --report wall-report
+stereovox calibrate wall recordings/wall --distance 1.4 --out camera.toml"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

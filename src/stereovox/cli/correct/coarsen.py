@@ -8,7 +8,8 @@ from typing import Any
 
 from stereovox.cli.maps import check_new, open_map, save_new
 
-EXAMPLE = "stereovox coarsen kitchen.svox kitchen10.svox --factor 2"
+EXAMPLES = """stereovox coarsen kitchen.svox kitchen10.svox --factor 2
+stereovox coarsen kitchen.svox kitchen20.svox --factor 4 --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

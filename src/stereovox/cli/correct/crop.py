@@ -10,7 +10,8 @@ from stereovox.cli.maps import check_new, open_map, save_new
 from stereovox.cli.options import CORNERS, numbers_of
 from stereovox.errors import StereovoxError
 
-EXAMPLE = "stereovox crop kitchen.svox table.svox --box=-1,-1,0,1,1,2"
+EXAMPLES = """stereovox crop kitchen.svox table.svox --box=-1,-1,0,1,1,2
+stereovox crop kitchen.svox floor.svox --box=-5,-5,-0.2,5,5,0.2"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -18,7 +18,8 @@ from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 if TYPE_CHECKING:
     from stereovox.correct.close_loops import ClosedMap, LoopClosure
 
-EXAMPLE = "stereovox loops kitchen.svox"
+EXAMPLES = """stereovox loops kitchen.svox
+stereovox loops kitchen.svox --json"""
 SHOWN, FAR_M = 5, 1.5
 """Refused places that are listed; and how far off poses may be before it is said what may be wrong."""
 

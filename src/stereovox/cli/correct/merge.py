@@ -22,7 +22,8 @@ from stereovox.geometry.se3 import rotation_vector
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
 
-EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071"
+EXAMPLES = """stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071
+stereovox merge kitchen.svox hall.svox --out both.svox --find"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -13,7 +13,8 @@ from typing import Any
 from stereovox.cli.maps import check_new, check_there, describe_saved, name_beside
 from stereovox.cli.terminal import say, say_about_compiling
 
-EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
+EXAMPLES = """stereovox remap kitchen.svox --poses corrected.tum
+stereovox remap kitchen.svox --poses corrected.tum --out remapped.svox"""
 
 FAR = 10.0
 """How many times the extent of their way frames may move without a note."""

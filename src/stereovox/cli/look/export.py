@@ -19,7 +19,8 @@ from stereovox.cli.terminal import say, size
 if TYPE_CHECKING:
     from stereovox.products.floor.floor_heights import FloorHeights
 
-EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
+EXAMPLES = """stereovox export kitchen.svox kitchen.bt
+stereovox export kitchen.svox kitchen.ply"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -18,7 +18,8 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
 
-EXAMPLE = "stereovox picture kitchen.svox kitchen.png --view layer --up=-y"
+EXAMPLES = """stereovox picture kitchen.svox kitchen.png --view layer --up=-y
+stereovox picture kitchen.svox kitchen.png --view space"""
 
 VIEW_OPTIONS = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "toward"), "space": ("eye", "toward")}
 """The options that each view uses besides the common ones."""

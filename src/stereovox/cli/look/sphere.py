@@ -17,7 +17,8 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.depth.sphere import Sight
 
-EXAMPLE = "stereovox sphere sim:surround --frames :4 --out sphere.png --step 2"
+EXAMPLES = """stereovox sphere sim:surround --frames :4 --out sphere.png --step 2
+stereovox sphere sim:surround --frames :1 --out one.png"""
 STEP_DEG = 1.0
 """Default where neither the options nor the profile set a step."""
 

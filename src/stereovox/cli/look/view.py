@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from stereovox.opening import Source
 
 TOKEN = "STEREOVOX_TOKEN"
-EXAMPLE = "stereovox view kitchen.svox"
+EXAMPLES = """stereovox view kitchen.svox
+stereovox view kitchen.svox --port 8081"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

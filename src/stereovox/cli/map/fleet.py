@@ -26,7 +26,8 @@ from stereovox.descriptions.description import many
 if TYPE_CHECKING:
     from stereovox.fleet import FleetMap, FleetPlan
 
-EXAMPLE = "stereovox fleet recordings/monday recordings/tuesday --out town.svox"
+EXAMPLES = """stereovox fleet recordings/monday recordings/tuesday --out town.svox
+stereovox fleet 'sim:town?drive=0' 'sim:town?drive=1' --out town.svox --workers 2 --voxel-size 0.2"""
 SHOWN = 5
 """Recordings with refused frames that are listed."""
 

@@ -23,7 +23,8 @@ from stereovox.files.safe_io import FLOOR_ENDINGS
 if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid
 
-EXAMPLE = "stereovox import building.bt building.svox"
+EXAMPLES = """stereovox import building.bt building.svox
+stereovox import scan.las scan.svox --voxel-size 0.1"""
 SUFFIXES_2D = (".yaml", ".yml", ".pgm", ".png", ".bmp")
 """Suffixes of floors' maps."""
 SUFFIXES_BAG = (".bag", ".mcap", ".db3", "")

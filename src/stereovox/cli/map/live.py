@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from stereovox.live.rig import LiveCamera
     from stereovox.live.run import LiveResult
 
-EXAMPLE = "stereovox live realsense: --poses udp://:5005 --out room.svox --view"
+EXAMPLES = """stereovox live realsense: --poses udp://:5005 --out room.svox --view
+stereovox live sim:room --out room.svox --mavlink udpout:127.0.0.1:14550"""
 PORT = 8080
 WAIT_S = 0.3
 """Copy of `live.stream.WAIT_S`, so that `--help` need not import it."""

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from stereovox.localize.track import Track
 
 TEXT, BAGS = (".tum", ".txt"), (".bag", ".mcap", ".db3")
-EXAMPLE = "stereovox localize floor.bag reference.yaml --out way.tum"
+EXAMPLES = """stereovox localize floor.bag reference.yaml --out way.tum
+stereovox localize floor.bag reference.yaml --start 1,2,90 --out path.tum --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from stereovox.runs.recording import MapResult
 
 PORT = 8080
-EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox"
+EXAMPLES = """stereovox map recordings/kitchen --out kitchen.svox
+stereovox map drive.bag --poses track --voxel-size 0.2 --max-range 20 --out drive.svox"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

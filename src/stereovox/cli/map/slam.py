@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from stereovox.localize.slam.pipeline import SlamResult
     from stereovox.sources.robots.robot import Robot
 
-EXAMPLE = "stereovox slam floor.bag --out reference.yaml"
+EXAMPLES = """stereovox slam floor.bag --out reference.yaml
+stereovox slam robot.log --set slam.voxel_size=0.1 --out office.yaml"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 ALIKE = ("profile", "max_range", "frames", "camera")
 """Options that `map` has, too, and that poses depend on."""
-EXAMPLE = "stereovox track recordings/kitchen --out way.tum"
+EXAMPLES = """stereovox track recordings/kitchen --out way.tum
+stereovox track recordings/kitchen --frames :300 --out start.tum"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -37,7 +37,8 @@ ALIKE = 0.3
 """IoU of walls within a cell below which two maps may be of different places."""
 TOLERANCE = 1
 """Cells of `--tolerance`, if it is not given."""
-EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
+EXAMPLES = """stereovox eval drive.svox truth.svox --report drive-report
+stereovox eval estimated.tum reference.tum --json"""
 MEASURES = {
     "precision": "of the cells called occupied, hold a surface",
     "recall": "of the surface cells, are called occupied",

@@ -15,7 +15,8 @@ from typing import Any
 from stereovox.cli.options import add_settings, overrides
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling, say_table, thousands
 
-EXAMPLE = "stereovox score 'training/image_02/*' --profile default --profile valenti2018 --voxel-size 0.5 --out scores"
+EXAMPLES = """stereovox score 'training/image_02/*' --profile default --profile valenti2018 --out scores
+stereovox score drives/* --voxel-size 0.2 --out scores --json"""
 SHOWN = ("recording", "profile", "frames", "refused", "accuracy", "precision", "recall", "specificity", "npv", "error",
          "correlation")  # fmt: skip
 

@@ -17,7 +17,8 @@ from stereovox.cli.terminal import cells_line, command_line, say, thousands, tra
 if TYPE_CHECKING:
     from stereovox.evaluate.lidar_truth import TruthCounts
 
-EXAMPLE = "stereovox truth 2011_09_26/2011_09_26_drive_0005_sync --out truth.svox --voxel-size 0.2 --max-range 20"
+EXAMPLES = """stereovox truth 2011_09_26/2011_09_26_drive_0005_sync --out truth.svox --voxel-size 0.2 --max-range 20
+stereovox truth sim:room --out truth.svox --voxel-size 0.1"""
 DROPPED = {
     "outside_view": "outside the left image",
     "in_boxes": "in annotated boxes",

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from stereovox.ros.options import Options
     from stereovox.runs.recording import Checkpoints
 
-EXAMPLE = "stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox"
+EXAMPLES = """stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox
+stereovox ros2 --scan /scan --out floor.yaml"""
 MAX_REPORTS = 10_000
 """Number of last frames whose times are summarised at the end."""
 

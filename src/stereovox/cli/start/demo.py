@@ -11,7 +11,8 @@ from typing import Any
 
 from stereovox.cli.terminal import cells_line, milliseconds, progress_of_steps, say, say_about_compiling
 
-EXAMPLE = "stereovox demo --out my-first-map"
+EXAMPLES = """stereovox demo --out my-first-map
+stereovox demo --voxel-size 0.1 --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -12,7 +12,8 @@ from typing import Any
 
 from stereovox.cli.terminal import say
 
-EXAMPLE = "stereovox info recordings/kitchen"
+EXAMPLES = """stereovox info recordings/kitchen
+stereovox info kitchen.svox --json"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

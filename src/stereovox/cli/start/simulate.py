@@ -13,7 +13,8 @@ from stereovox.cli.robot_options import open_noting
 from stereovox.cli.terminal import command_line, progress_bar, say, size
 from stereovox.files.safe_io import check_file
 
-EXAMPLE = "stereovox simulate sim:floor --out floor.bag"
+EXAMPLES = """stereovox simulate sim:floor --out floor.bag
+stereovox simulate 'sim:floor?plan=testbed&seconds=60' --out testbed.mcap"""
 
 
 def add_arguments(parser: ArgumentParser) -> None:

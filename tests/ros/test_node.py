@@ -311,12 +311,23 @@ def test_a_jump_of_odometry_in_the_map_is_noticed_while_it_drives(robot):
     other.destroy_node()
 
 
+def latched(robot, kind, topic):
+    """Return what a subscriber gets that comes now."""
+    robot.listen(kind, topic)
+    robot.until(lambda: robot.came[topic])
+    return robot.came[topic][0]
+
+
 def test_save_reset_and_load(robot, tmp_path):
     robot.drive(3)
     before = robot.mapping.snapshot()().storage.blocks()
     saved = robot.call(Trigger, "/stereovox/save")
     assert (saved.success, "3 frames" in saved.message) == (True, True)
+    assert max(latched(robot, OccupancyGrid, "/map_mapping").data) > 50
+    assert len(latched(robot, PointCloud2, "/occupied_cells").data)
     assert robot.call(Trigger, "/stereovox/reset").success
+    assert list(latched(robot, OccupancyGrid, "/map_mapping").data) == [-1]
+    assert len(latched(robot, PointCloud2, "/occupied_cells").data) == 0
     assert robot.mapping.history.frames == 0
     assert len(robot.mapping.snapshot()().occupied()) == 0
     missing = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=str(tmp_path / "nothing")))
@@ -325,6 +336,9 @@ def test_save_reset_and_load(robot, tmp_path):
     assert no_name.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     loaded = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=f"file://{tmp_path / 'live.svox'}"))
     assert loaded.result == LoadMap.Response.RESULT_SUCCESS
+    assert loaded.map.data == latched(robot, OccupancyGrid, "/map_mapping").data
+    assert max(loaded.map.data) > 50
+    assert (loaded.map.info.resolution, loaded.map.header.frame_id) == (pytest.approx(0.1), "odom")
     for mine, theirs in zip(robot.mapping.snapshot()().storage.blocks(), before, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert load_map(tmp_path / "live.svox").frames == 3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereovox.errors import SourceError
+from stereovox.errors import FrameRefused, SourceError
 from stereovox.geometry.se3 import from_quaternion
 from stereovox.sources.poses.pose_stream import (
     MAX_LINE,
@@ -74,9 +74,14 @@ def test_lines_that_cannot_be_read_are_counted_and_told(stream, line):
 
 
 def test_poses_of_low_confidence_cannot_be_used(stream):
-    send(stream, b"1 0 0 0 0 0 0 1 1")
-    wait_for(lambda: stream.poses.added == 1)
-    assert (stream.counts["low_confidence"], stream.poses.counts["unusable"]) == (1, 1)
+    send(stream, b"1 0 0 0 0 0 0 1 1\n1.05 0 0 0 0 0 0 1 3\n1.1 0 0 0 0 0 0 1 1\n")
+    wait_for(lambda: stream.poses.added == 3)
+    assert (stream.counts["low_confidence"], stream.poses.counts["unusable"]) == (2, 2)
+    for stamp_ns in (10**9, 1_020_000_000, 1_080_000_000):
+        with pytest.raises(FrameRefused, match="the tracker does not trust its pose") as refused:
+            stream.poses.at(stamp_ns)
+        assert refused.value.reason == "low_confidence"
+    assert np.isfinite(stream.poses.at(1_050_000_000)).all()
 
 
 def test_an_address_in_use_is_told(stream):

@@ -176,7 +176,7 @@ ELSEWHERE = {
     "missing_file": "no such image or cloud",
     "unreadable": "the file or message is damaged, truncated, or of another kind",
     "bad_pose_file": "a pose that cannot be read",
-    "low_confidence": "camera pair: the tracker trusts its pose less than `min_confidence`",
+    "low_confidence": "camera pair, live: the tracker trusts its pose less than `min_confidence`",
     "not_localised": "the ROS 2 node does not know where the robot is in its map",
     "clock_doubt": "live, ROS 2: it is not known how far the clocks of sensors and poses are apart",
     "no_camera": "ROS 2: no camera info has come",

@@ -227,9 +227,9 @@ class MapNode:
             self._outputs.corrected()
             self._node.get_logger().info(f"corrected: {report.moved} frames moved, {report.mapped} were mapped again")
 
-    def _renewed(self) -> None:
+    def _renewed(self) -> Any:
         self.waiting.clear()
         self._clocks.forget()
         if self._corrector is not None:
             self._corrector.forget()
-        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")
+        return self._outputs.renewed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")

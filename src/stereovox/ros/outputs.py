@@ -148,6 +148,24 @@ class Outputs:
         self._stamp_ns, self._frame_id = stamp_ns, frame_id
         self._new_map = self._new_cloud = True
 
+    def renewed(self, stamp_ns: int, frame_id: str) -> Any:
+        """Publish the map that has replaced another, so that nobody who comes later gets the old one; return it in 2-D.
+
+        A map without a known cell is one unknown cell: a `nav_msgs/OccupancyGrid` without cells clears nobody's copy.
+        """
+        self.changed(stamp_ns, frame_id)
+        try:
+            grid = self._mapping.grid()
+        except StereovoxError as error:
+            self._log_error(error)
+            grid = None
+        grid = grid or OccupancyGrid(np.full((1, 1), -1, np.int8), self._mapping.config.voxel_size)
+        message = occupancy_message(grid, stamp_ns, frame_id)
+        self._publishers.map.publish(message)
+        if self._mapping.config.dimensions == 3:
+            self._worker.submit(self._publishers.send, VoxelMap(self._mapping.config), stamp_ns, frame_id, True)
+        return message
+
     def corrected(self) -> None:
         """Mark the map as changed by other means than a frame; its newest frame is the same."""
         self._new_map = self._new_cloud = self._corrected = True
@@ -243,11 +261,11 @@ class _Publishers:
         """Return whether the cloud or the OctoMap has a subscriber."""
         return any(one is not None and one.get_subscription_count() > 0 for one in (self._cloud, self._octomap))
 
-    def send(self, voxel_map: VoxelMap, stamp_ns: int, frame_id: str) -> None:
-        """Publish the cloud and the OctoMap where they have subscribers."""
-        if self._cloud is not None and self._cloud.get_subscription_count():
+    def send(self, voxel_map: VoxelMap, stamp_ns: int, frame_id: str, to_nobody: bool = False) -> None:
+        """Publish the cloud and the OctoMap if they have subscribers; to_nobody: also if not, for later ones."""
+        if self._cloud is not None and (to_nobody or self._cloud.get_subscription_count()):
             self._cloud.publish(cloud_message(voxel_map, stamp_ns, frame_id))
-        if self._octomap is not None and self._octomap.get_subscription_count():
+        if self._octomap is not None and (to_nobody or self._octomap.get_subscription_count()):
             self._octomap.publish(octomap_message(voxel_map, self._full, stamp_ns, frame_id))
 
 

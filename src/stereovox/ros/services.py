@@ -22,8 +22,9 @@ def check_continuable(path: str, continuable: bool) -> None:
 class Services:
     """`~/save` and `~/reset` (std_srvs/Trigger), `~/load` (nav_msgs/LoadMap).
 
-    out: returns where to save, "": nowhere. renewed: called after another map has replaced the current one.
-    continuable: whether saved maps can be continued with the poses that there are. They run between two frames.
+    out: returns where to save, "": nowhere. renewed: called after another map has replaced the current one; returns it
+    as a `nav_msgs/OccupancyGrid`. continuable: whether saved maps can be continued with the poses that there are. They
+    run between two frames.
     """
 
     def __init__(
@@ -31,7 +32,7 @@ class Services:
         node: Any,
         mapping: Mapping,
         out: Callable[[], str],
-        renewed: Callable[[], None],
+        renewed: Callable[[], Any],
         continuable: bool = True,
     ):
         from nav_msgs.srv import LoadMap
@@ -74,7 +75,7 @@ class Services:
             self._log.error(str(error))
             response.result = response.RESULT_INVALID_MAP_DATA
             return response
-        self._renewed()
+        response.map = self._renewed()
         self._log.info(f"going on with {path}")
         response.result = response.RESULT_SUCCESS
         return response

@@ -74,12 +74,13 @@ class LivePoses:
         self._speed, self._turn, self._clock = max_speed_mps, np.radians(max_turn_dps), clock
         self._stamps: list[int] = []
         self._poses: dict[int, Transform] = {}
+        self._unsure: set[int] = set()
         self._change, self._ended = Condition(), ""
         self._listeners: list[Callable[[], object]] = []
         self._late: list[_Late] = []
         self.delays = Delays()
 
-    def add(self, stamp_ns: int, T_world_body: ArrayLike) -> None:
+    def add(self, stamp_ns: int, T_world_body: ArrayLike, confident: bool = True) -> None:
         """Take in a pose; the first of several with one stamp counts.
 
         Args:
@@ -87,8 +88,12 @@ class LivePoses:
             T_world_body: (4, 4), maps the body (x forward, y left, z up) into the world (z up). One that is not
                 finite or no rigid motion is remembered as unusable, and whatever needs it is refused: say so with NaN
                 where a tracker is lost.
+            confident: Whether its tracker trusts it; a pose that it does not trust is unusable, too.
         """
         stamp_ns, T = int(stamp_ns), np.array(T_world_body, float)
+        if not confident:
+            self._unsure.add(stamp_ns)
+            T = np.full((4, 4), np.nan)
         if rigidity_error(T) > RIGID or not np.isfinite(T).all():
             self.counts["unusable"] += 1
             T = np.full((4, 4), np.nan)
@@ -113,7 +118,8 @@ class LivePoses:
 
         Raises:
             FrameRefused: `no_pose` if a neighbour did not come in time or is 0.1 s or more away, `pose_jump` if
-                the body jumped between them, `bad_pose_file` if a neighbour cannot be used.
+                the body jumped between them, `low_confidence` if its tracker does not trust a neighbour,
+                `bad_pose_file` if a neighbour cannot be used for another reason.
         """
         stamp_ns = int(stamp_ns)
         with self._change:
@@ -123,6 +129,7 @@ class LivePoses:
                     self._change.wait(left)
             near, ended = self._near(stamp_ns), self._ended
             poses = [self._poses[stamp] for stamp in near]
+            unsure = [stamp for stamp in near if stamp in self._unsure]
         if not near:
             raise FrameRefused("no_pose", f"{self.where}: {ended or 'no pose has come yet'}")
         if near[0] - stamp_ns > CLOCKS_APART_NS or stamp_ns - near[-1] > CLOCKS_APART_NS:
@@ -132,6 +139,9 @@ class LivePoses:
         except FrameRefused as refused:
             if ended and refused.reason == "no_pose":
                 raise FrameRefused("no_pose", f"{refused} ({ended})") from None
+            if unsure and refused.reason == "bad_pose_file":
+                said = f"{self.where}: the tracker does not trust its pose at {seconds_from_ns(unsure[0])} s"
+                raise FrameRefused("low_confidence", f"{said}; leave the image out") from None
             raise
         if len(near) == 2 and self._is_jump(near, poses):
             times = " and ".join(seconds_from_ns(stamp) for stamp in near)
@@ -214,6 +224,7 @@ class LivePoses:
         for stamp in self._stamps[left:]:
             del self._poses[stamp]
         del self._stamps[left:]
+        self._unsure &= self._poses.keys()
 
     def _insert_late(self) -> None:
         late, self._late = self._late, []
@@ -232,6 +243,7 @@ class LivePoses:
             for old in stamps[: KEPT // 2]:
                 del self._poses[old]
             del stamps[: KEPT // 2]
+            self._unsure &= self._poses.keys()
         self._poses[stamp_ns] = T
         insort(stamps, stamp_ns)
         if len(stamps) > 1 and stamps[-1] == stamp_ns:

@@ -138,10 +138,10 @@ class LineStream(PoseStream):
             self.counts["bad"] += 1
             self.trouble = f"{self.name}: a line cannot be read ({_short(text)}: {error}); send '{FORMAT}'"
             return
-        if confidence < CONFIDENT:
+        confident = confidence >= CONFIDENT
+        if not confident:
             self.counts["low_confidence"] += 1
-            T = np.full((4, 4), np.nan)
-        self.poses.add(stamp_ns, body_pose(T, self.axes))
+        self.poses.add(stamp_ns, body_pose(T, self.axes), confident)
 
 
 class UdpPoses(LineStream):
@@ -254,10 +254,10 @@ class T265(PoseStream):
             T = from_quaternion((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
         except ValueError:
             T = np.full((4, 4), np.nan)
-        if data.tracker_confidence < CONFIDENT:
+        confident = data.tracker_confidence >= CONFIDENT
+        if not confident:
             self.counts["low_confidence"] += 1
-            T = np.full((4, 4), np.nan)
-        self.poses.add(ns_from_ms(image.get_timestamp()), body_pose(T, "opengl"))
+        self.poses.add(ns_from_ms(image.get_timestamp()), body_pose(T, "opengl"), confident)
 
 
 def read_line(text: str) -> tuple[int, Transform, float]:

@@ -90,6 +90,8 @@ def test_something_must_be_mapped():
         (["--depth", DEPTH, "--exclude", "0,0,1,1"], "give --reference MAP.yaml"),
         (["--lidar", "/scan", "--poses", "slam", "--reference", "x.yaml", "--exclude", "0,0,1"], "give X0,Y0,X1,Y1"),
         (["--depth", DEPTH, "--slam-out", "x.yaml"], "add --poses slam"),
+        (["--depth", DEPTH, "--set", "ros.cloud_rat=2"], "did you mean 'ros.cloud_rate'"),
+        (["--depth", DEPTH, "--set", "ros.cloud_rate=x"], "ros.cloud_rate 'x': give a float"),
     ],
 )
 def test_mistakes_end_in_one_line(capsys, words, said):

@@ -281,18 +281,19 @@ def _save(mapping: Mapping, out: str, few: str = "") -> bool:
 def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     """Return the settings of the map and the options of the node; the command line overrides parameters."""
     from stereovox.config import load_config
-    from stereovox.ros.options import LISTS, Options, given_parameters, with_parameters
+    from stereovox.ros.options import LISTS, PREFIX, Options, given_parameters, with_parameters
 
-    given = given_parameters(node)
+    given, settings = given_parameters(node), overrides(arguments)
+    options = {name: settings.pop(name) for name in [*settings] if name.startswith(PREFIX)}
     profile = arguments.profile or given.settings.pop("profile", "default")
     given.settings.pop("profile", None)
-    config = load_config(profile, **{**given.settings, **overrides(arguments)})
+    config = load_config(profile, **{**given.settings, **settings})
     corrections = "corrected_path", "path_frame", "correct_jumps"
     localisation = "lidar", "start", "slam_out", "reference"
     names = *LISTS, "poses", *localisation, "world_frame", "base_frame", *corrections, "out"
     named = {name: getattr(arguments, name) for name in names}
-    given_options = {name: value for name, value in named.items() if value}
-    return config, with_parameters(Options(), {**given.options, **given_options})
+    given.options.update({name.removeprefix(PREFIX): value for name, value in options.items()})
+    return config, with_parameters(Options(), {**given.options, **{name: one for name, one in named.items() if one}})
 
 
 def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:

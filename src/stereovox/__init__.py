@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from stereovox.maps.record.health import Health as Health
     from stereovox.mavlink.directions import DirectionRules as DirectionRules
     from stereovox.mavlink.link import MavlinkLink as MavlinkLink
+    from stereovox.mavlink.pose_sender import PoseSender as PoseSender
     from stereovox.mavlink.poses import PoseReceiver as PoseReceiver
     from stereovox.mavlink.poses import receive_poses as receive_poses
     from stereovox.mavlink.sectors import SectorRules as SectorRules
@@ -181,6 +182,7 @@ _HOMES = {
     "SectorRules": "mavlink.sectors",
     "obstacle_sectors": "mavlink.sectors",
     "ObstacleSender": "mavlink.sending",
+    "PoseSender": "mavlink.pose_sender",
     "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",

@@ -80,6 +80,8 @@ def understood(message, machine_s, ahead_s):
     if kind == "OBSTACLE_DISTANCE_3D":
         keys = ("x", "y", "z", "min_distance", "max_distance", "frame", "obstacle_id", "time_boot_ms")
         return {"is": kind, **out, **{key: getattr(message, key) for key in keys}}
+    if kind in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+        return {"is": kind, **out, **message.to_dict()}
     if kind == "TIMESYNC" and message.tc1:
         return {"is": "answer", **out, "tc1": message.tc1, "ts1": message.ts1}
     return None

@@ -58,13 +58,24 @@ class World:
         assert not report.refused, report.detail
         return frame, report
 
-    def sender(self, heard):
-        link = SimpleNamespace(
+    def link(self, heard):
+        return SimpleNamespace(
             url="x", messages=dialect(), now_ns=lambda: self.ns, send=lambda m: heard.append(m) or True
         )
-        sender = sv.ObstacleSender(self.mapper, link, rate_hz=None, tell=lambda line: None)
+
+    def sender(self, heard):
+        sender = sv.ObstacleSender(self.mapper, self.link(heard), rate_hz=None, tell=lambda line: None)
         sender.after(*self.frames[-1])
         return sender
+
+
+def old_poses_are_not_sent():
+    """The second pose comes 3 s late."""
+    world, heard = World(frames=1), []
+    sender = sv.PoseSender(world.link(heard), message="vision_position_estimate", tell=lambda line: None)
+    fresh = sender.pose(world.ns, np.eye(4))
+    world.ns += 3 * S
+    return fresh and not sender.pose(world.ns - 3 * S + 1, np.eye(4)) and len(heard) == 1
 
 
 def refused(act):
@@ -204,6 +215,7 @@ PROBES = {
     ("sv.ObstacleSender", "age"): lambda: "old" in World(late_s=3.0).sender([]).send(),
     ("sv.ObstacleSender", "health"): lambda: "old" in World(late_s=3.0).sender([]).send(),
     ("sv.ObstacleSender", "unknown"): unknown_ends_free,
+    ("sv.PoseSender", "age"): old_poses_are_not_sent,
     ("sv.check_path", "unknown"): path_is_blocked,
     ("sv.LiveView", "health"): page_says_stale,
     ("live.GridFile", "health"): grid_file_is_silent,
@@ -326,6 +338,7 @@ MUTATIONS = [
     (("sv.ObstacleSender", "up"), sectors, "up_of", flat_up),
     (("sv.ObstacleSender", "age"), StampClock, "age_ns", lambda *_: 0),
     (("sv.ObstacleSender", "unknown"), sectors, "states_of", free_states),
+    (("sv.PoseSender", "age"), StampClock, "age_ns", lambda *_: 0),
     (
         ("sv.ObstacleSender", "frame"),
         Body,

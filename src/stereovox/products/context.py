@@ -121,6 +121,7 @@ OUTPUTS: dict[str, Leaves] = {
     "sv.ObstacleSender": Leaves(
         "uses: distances from the body's newest pose", LEVEL, NO_FLOOR, OLD, OLD, "uses: ends what is free"
     ),
+    "sv.PoseSender": POSE._replace(frame="carries along: MAV_FRAME_LOCAL_FRD and MAV_FRAME_BODY_FRD"),
     "sv.check_path": Leaves(WORLD, SPACE, NO_FLOOR, MAP, JUDGED, "refuses: blocks the path"),
     "sv.frontiers": Leaves(WORLD, "carries along: the setting `up`", FLOOR_2D, OFFLINE, JUDGED, "uses: it is the goal"),
     "sv.LevelPlanner": Leaves(WORLD, "carries along: layers of the map", NO_FLOOR, OFFLINE, JUDGED, "refuses: no way"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 from math import asin, atan2, cos, sin
-from time import time_ns
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.frame.stamp_clock import StampClock
+from stereovox.frame.wall_clock import epoch_ns
 from stereovox.geometry.se3 import Transform, apart, orthonormalise, rigidity_error, rotation_vector
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
 from stereovox.sources.poses.live_poses import MAX_SPEED_MPS, MAX_TURN_DPS, RIGID
@@ -81,7 +81,7 @@ class PoseSender:
         self._period_ns, self._max_age_ns = EARLY * 1e9 / rate_hz, max_age_s * 1e9
         self._own = isinstance(connection, str)
         self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
-        self._clock = StampClock(self.link.now_ns, "live", time_ns, ordered=False)
+        self._clock = StampClock(self.link.now_ns, "live", epoch_ns, ordered=False)
         self.sent = self.reset_counter = 0
         self._last: tuple[int, Transform] | None = None
         self._sent_ns, self._why, self._stepped = -(1 << 62), "", False

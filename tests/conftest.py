@@ -6,6 +6,7 @@ import os
 import signal
 
 import pytest
+from examples import example_runner
 from made_bucket import s3, where  # noqa: F401 - fixtures
 from made_domains import domains  # noqa: F401 - a fixture
 from xdist.scheduler import WorkStealingScheduling
@@ -23,12 +24,9 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def no_waiting_for_disks():
+def pytest_sessionstart():
     """No test turns the power off, so none waits until files lie on the disk; a file must be open all the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: os.fstat(file if isinstance(file, int) else file.fileno()) and None)
-        yield
+    os.fsync = lambda file: os.fstat(file if isinstance(file, int) else file.fileno()) and None
 
 
 @pytest.fixture
@@ -39,6 +37,13 @@ def obeys_signals():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(scope="session")
+def run_script():
+    """Runs a script in a process of its own, and returns its exit status and what it printed."""
+    with example_runner() as run:
+        yield run
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from examples import example_runner
 
 import stereovox
 from stereovox.cli import _parse
@@ -31,12 +30,6 @@ SHOWN = {line_of(page, found.start()): (found[1], found[2]) for page, found in B
 FILES = sorted((ROOT / "examples").glob("*.py"))
 EXAMPLES = {line_of(page, found.start()): found[2] for page, found in BLOCKS if not found[1]}
 EXAMPLES |= {f"examples/{path.name}": path.read_text() for path in FILES if "sys.argv" not in path.read_text()}
-
-
-@pytest.fixture(scope="module")
-def run_script():
-    with example_runner() as run:
-        yield run
 
 
 @pytest.mark.parametrize("where", EXAMPLES)

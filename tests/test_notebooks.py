@@ -2,9 +2,6 @@
 """Notebooks run from top to bottom, without data, and end with a picture."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,13 +9,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "examples/notebooks").glob("*.ipynb"))
 RUN = """
-import ast, json, sys
+import ast, json, os, sys
+
+for name in [*os.environ]:
+    if name.startswith("STEREOVOX_KITTI") or name == "STEREOVOX_BAG":
+        del os.environ[name]
+os.environ["MPLBACKEND"] = "Agg"
 import matplotlib.pyplot as plt
 
-for blocked in sys.argv[2:]:
-    sys.modules[blocked] = None
+cells, blocked = json.load(open("cells.json"))
+for name in blocked:
+    sys.modules[name] = None
 names = {"__name__": "__main__"}
-for number, source in enumerate(json.load(open(sys.argv[1]))):
+for number, source in enumerate(cells):
     plt.close("all")
     tree, shown = ast.parse(source, f"code cell {number}"), None
     silent = source.rstrip().endswith(";")
@@ -42,17 +45,18 @@ def code(notebook):
     return ["".join(cell["source"]) for cell in cells(notebook) if cell["cell_type"] == "code"]
 
 
-def run(notebook, folder, *blocked):
-    """Run a notebook in a process of its own, where the modules `blocked` are not installed."""
-    (folder / "cells.json").write_text(json.dumps(code(notebook)))
-    command = [sys.executable, "-c", RUN, "cells.json", *blocked]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("STEREOVOX_KITTI")}
-    environment.pop("STEREOVOX_BAG", None)
-    done = subprocess.run(
-        command, cwd=folder, env={**environment, "MPLBACKEND": "Agg"}, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, f"{notebook.name}\n{done.stderr[-3000:]}"
-    return done.stdout
+@pytest.fixture
+def run(run_script, tmp_path):
+    """Runs a notebook in a process of its own, where the modules `blocked` are not installed; returns what it said."""
+
+    def run(notebook, *blocked):
+        (tmp_path / "cells.json").write_text(json.dumps([code(notebook), blocked]))
+        (tmp_path / "notebook.py").write_text(RUN)
+        status, said = run_script(tmp_path / "notebook.py")
+        assert status == 0, f"{notebook.name}\n{said[-3000:]}"
+        return said
+
+    return run
 
 
 def test_there_are_notebooks():
@@ -60,25 +64,25 @@ def test_there_are_notebooks():
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
-def test_a_notebook_runs_and_ends_with_a_picture(notebook, tmp_path):
+def test_a_notebook_runs_and_ends_with_a_picture(notebook, run):
     if "rosbags" in notebook.read_text():
         pytest.importorskip("rosbags", reason="needs pip install '.[bags]'")
-    assert run(notebook, tmp_path).endswith("last: picture\n")
+    assert run(notebook).endswith("last: picture\n")
 
 
-def test_without_octomap_the_comparison_is_left_out(tmp_path):
+def test_without_octomap_the_comparison_is_left_out(run):
     (notebook,) = (path for path in NOTEBOOKS if "octomap" in path.name)
-    said = run(notebook, tmp_path, "octomap")
+    said = run(notebook, "octomap")
     assert "pip install octomap-python" in said
     assert "agrees" not in said
     assert said.endswith("last: picture\n")
 
 
-def test_a_cell_that_fails_is_seen(tmp_path):
+def test_a_cell_that_fails_is_seen(run, tmp_path):
     broken = tmp_path / "broken.ipynb"
     broken.write_text(json.dumps({"cells": [{"cell_type": "code", "source": ["x = 1\n", "1 / 0"]}]}))
     with pytest.raises(AssertionError, match="code cell 0"):
-        run(broken, tmp_path)
+        run(broken)
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)

@@ -33,6 +33,12 @@ def flight(**settings):
     return mapper.map
 
 
+@cache
+def part():
+    """Return a corner of that map, for tests in which all of it would only take longer."""
+    return sv.crop(flight(), [0, 0, 0], [4, 4, 2])
+
+
 def put_at(where, box_m=2 * BOX_M, **settings):
     """Save the map in boxes."""
     sv.save_boxed(flight(**settings), where, box_m)
@@ -196,7 +202,7 @@ class VoxelCells:
 
 
 def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
-    put_at(where)
+    sv.save_boxed(part(), where, BOX_M)
     before = sv.load_map(where).storage.blocks()
 
     def stop(*_):
@@ -215,23 +221,23 @@ def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
 
 
 def test_a_manifest_that_could_not_be_read_is_not_written(tmp_path, monkeypatch):
-    put_at(tmp_path / "m.svox")
+    sv.save_boxed(part(), tmp_path / "m.svox", 2 * BOX_M)
     before = sv.load_map(tmp_path / "m.svox").storage.blocks()
     monkeypatch.setattr(boxed_manifest, "MAX_MANIFEST", len((tmp_path / "m.svox/manifest.json").read_bytes()))
     with pytest.raises(MapFileError, match="choose larger boxes"):
-        sv.save_boxed(sv.load_map(tmp_path / "m.svox"), tmp_path / "n.svox", 0.4)
+        sv.save_boxed(sv.load_map(tmp_path / "m.svox"), tmp_path / "n.svox", BOX_M / 2)
     assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), before)
 
 
 def test_there_is_one_writer(where):
     place = Place.of(where)
     with only_writer_at(place), ThreadPoolExecutor(1) as other, pytest.raises(MapFileError, match="another"):
-        other.submit(sv.save_boxed, flight(), where).result()
-    sv.save_boxed(flight(), where)
+        other.submit(sv.save_boxed, part(), where).result()
+    sv.save_boxed(part(), where)
 
 
 def test_damage_is_told_by_the_box(where):
-    put_at(where)
+    sv.save_boxed(part(), where, BOX_M)
     place = Place.of(where)
     entry = read_boxed_manifest(place).boxes[5]
     name = f"{entry.name}/cells/c/0/0"

@@ -33,9 +33,9 @@ def test_a_scan_means_what_rep_117_says(ros, little):
     assert (read.stamp_ns, read.frame_id) == (STAMP, "laser")
     assert (read.angle_min, read.angle_step) == (-1, 0.5)
     assert (read.range_min, read.range_max) == (np.float32(0.1), np.float32(5.6))
-    wanted = [1.5, NAN, INF, -INF, -INF, -INF, 0.1, INF, INF, 5.59]
+    wanted = [1.5, NAN, INF, -INF, -INF, -INF, 0.1, INF, NAN, 5.59]
     np.testing.assert_array_equal(read.ranges, np.array(wanted, np.float32))
-    assert read.ranges.dtype == np.float32
+    assert (read.ranges.dtype, read.beyond) == (np.float32, 1)
 
 
 def test_zero_is_no_reading_even_where_the_scan_begins_at_zero():
@@ -48,6 +48,9 @@ def test_another_range_max_counts_in_place_of_the_told_one():
     made = Messages(1)
     wire = made.wire(SCAN, made.scan(STAMP, [3.0, 5.0, 9.0], range_max=INF))
     np.testing.assert_array_equal(read_laser_scan(wire, 4.0).ranges, np.array([3, INF, INF], np.float32))
+    read = read_laser_scan(made.wire(SCAN, made.scan(STAMP, [3.0, 5.6, 65.533])), 5.6)
+    np.testing.assert_array_equal(read.ranges, np.array([3, INF, INF], np.float32))
+    assert read.beyond == 0
 
 
 @pytest.mark.parametrize(

@@ -337,6 +337,22 @@ CLOUD = [[3.0, 0, 0.1], [2.0, 0, 5.0], [2.5, 0, -0.2], [0, 1.0, 0.5], [np.nan, 0
 """As seen from `laser`, 0.225 m high: ahead at 3 m, above the band at 2 m, below it at 2.5 m, to the left at 1 m."""
 
 
+def test_ranges_beyond_range_max_are_discarded_with_a_note_unless_they_are_said_to_be_far(tmp_path):
+    def scans(bag: RobotBagMaker) -> None:
+        for k in range(3):
+            bag.add("/scan", "sensor_msgs/LaserScan", at(k), bag.scan(at(k), [1.0, 65.533, 5.6, 65.533]))
+
+    path = made(tmp_path / "a.bag", mounts, drive, scans)
+    robot = RobotBag(path)
+    np.testing.assert_array_equal(robot.scans[1].ranges, np.array([1, np.nan, np.inf, np.nan], np.float32))
+    [note] = [note for note in robot.notes if "beyond" in note]
+    assert note.endswith("50 % of the ranges of /scan are beyond its range_max and are discarded; if they mean that "
+                         "nothing is there, give ?range_max=5.6")  # fmt: skip
+    far = RobotBag(f"{path}?range_max=5.6")
+    np.testing.assert_array_equal(far.scans[1].ranges, np.array([1, np.inf, np.inf, np.inf], np.float32))
+    assert not [note for note in far.notes if "beyond" in note]
+
+
 @ENDINGS
 def test_point_clouds_stand_in_for_a_lidar(tmp_path, ending):
     def clouds(bag: RobotBagMaker) -> None:

@@ -77,6 +77,16 @@ def test_ranges_that_mean_nothing_seen_are_infinite(tmp_path, far, option, infin
     assert f"{scan.range_max:g} m" in robot.notes[0]
 
 
+@pytest.mark.parametrize(("mark", "between", "known"), [(81.83, 30.0, False), (81.83, 70.0, True), (29.9, 20.0, False)])
+def test_marks_of_no_echo_are_found_by_the_gap_below_them(tmp_path, mark, between, known):
+    """A log whose driver writes a number of its own; what lies in the gap shows that these are distances."""
+    text = "".join(flaser([1.0 + 0.1 * k % 20, between, *[mark] * 3, 5.0], stamp=f"1{k}.5") for k in range(10))
+    robot = CarmenLog(log(tmp_path, text))
+    assert np.isfinite(robot.scans[0].ranges).tolist() == [True, True, *[known] * 3, True]
+    assert (f"ranges of {robot.scans[0].range_max:g} m and more are no echo" in robot.notes[0]) is True
+    assert robot.scans[0].range_max < 82
+
+
 def test_without_an_echo_nothing_is_known_unless_one_says_so(tmp_path):
     path = log(tmp_path, flaser([1.0, 81.91]))
     assert np.isnan(CarmenLog(path).scans[0].ranges[1])

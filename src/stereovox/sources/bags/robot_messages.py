@@ -39,7 +39,8 @@ class LaserScan:
     """A `sensor_msgs/LaserScan`.
 
     ranges: (N,) float32 metres as in `frame.Scan`: NaN no reading, -inf too near, +inf nothing up to `range_max`.
-    angle_min, angle_step: radians; range_min, range_max: metres.
+    angle_min, angle_step: radians; range_min, range_max: metres. beyond: number of ranges that were discarded because
+    they are beyond `range_max`.
     """
 
     stamp_ns: int
@@ -49,19 +50,20 @@ class LaserScan:
     range_min: float
     range_max: float
     ranges: NDArray[np.float32]
+    beyond: int = 0
 
 
 def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
-    """Return a `sensor_msgs/LaserScan`; `range_max`, if given, replaces the message's own.
+    """Return a `sensor_msgs/LaserScan`; `range_max`, if given, replaces the message's own, and all beyond it is far.
 
     Ranges become (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for "no reading")
-    become -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for "no
-    echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that make no
-    sense.
+    become -inf, which clears nothing; range_max itself and +inf become +inf, which clears up to range_max. Ranges
+    beyond the message's own range_max are discarded (NaN), as LaserScan.msg asks: some drivers write range_max + 1 for
+    "nothing there", others 65.533 m for "dazzled". Raises ValueError also for invalid angles and limits.
     """
     stamp_ns, frame_id = wire.header()
     angle_min, _, angle_step, _, _, range_min, declared_max = wire.numbers("f", 7)
-    range_max = range_max or declared_max
+    given, range_max = range_max, range_max or declared_max
     count = wire.number()
     if count > MAX_BEAMS:
         raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")
@@ -74,15 +76,12 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
         raise ValueError(
             f"a scan between range_min {range_min:g} and range_max {range_max:g} is none; give ?range_max="
         )
-    marked = marked_ranges(ranges, range_min, range_max)
-    return LaserScan(stamp_ns, frame_id, angle_min, angle_step, range_min, range_max, marked)
-
-
-def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
-    """Return (N,) float32 ranges in which only those in [range_min, range_max) are numbers (see `LaserScan`)."""
     with np.errstate(invalid="ignore"):
         near = (ranges < np.float32(range_min)) | (ranges <= 0)
-        return np.where(near, -np.inf, np.where(ranges >= np.float32(range_max), np.inf, ranges)).astype(np.float32)
+        far = ranges >= np.float32(range_max)
+        beyond = (ranges > np.float32(range_max)) & (ranges < np.inf) & (not given)
+    marked = np.where(near, -np.inf, np.where(beyond, np.nan, np.where(far, np.inf, ranges))).astype(np.float32)
+    return LaserScan(stamp_ns, frame_id, angle_min, angle_step, range_min, range_max, marked, int(beyond.sum()))
 
 
 @dataclass(frozen=True, eq=False)

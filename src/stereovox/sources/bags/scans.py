@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
@@ -23,6 +24,8 @@ from stereovox.sources.bags.robot_messages import (
 )
 from stereovox.sources.bags.tf import Edge
 
+SAMPLED = 5
+"""Scans that are read for the notes."""
 MAX_ATTEMPTS = 5
 """Messages tried before a topic counts as unreadable."""
 
@@ -41,6 +44,20 @@ class ScanTopic:
 
     def __len__(self) -> int:
         return len(self._stamps)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of the ranges, by the first scans; each is one line."""
+        scans: list[LaserScan] = []
+        for i in range(min(SAMPLED, len(self))):
+            with suppress(FrameRefused):
+                scans += [scan for scan in [self.read(i)] if isinstance(scan, LaserScan)]
+        beyond = sum(scan.beyond for scan in scans)
+        if not beyond:
+            return ()
+        share = f"{100 * beyond / sum(len(scan.ranges) for scan in scans):.0f} % of the ranges of {self.topic}"
+        cure = f"if they mean that nothing is there, give ?range_max={scans[0].range_max:g}"
+        return (f"{self.path}: {share} are beyond its range_max and are discarded; {cure}",)
 
     def name(self, i: int) -> str:
         """Return what to call scan `i` in messages."""
@@ -70,7 +87,8 @@ def find_scans(
     """
     if topic:
         check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
-        return ScanTopic(file, topic, range_max), ()
+        scans = ScanTopic(file, topic, range_max)
+        return scans, scans.notes
     found = _topics_of_type(file, LASER_SCAN)
     if not found:
         clouds = _topics_of_type(file, POINT_CLOUD)
@@ -81,7 +99,8 @@ def find_scans(
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
         note = (f"{file.path}: scans of {best}, which has most; there are {others} too: say ?scan=/topic for those",)
-    return ScanTopic(file, best, range_max), note
+    scans = ScanTopic(file, best, range_max)
+    return scans, (*note, *scans.notes)
 
 
 def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:

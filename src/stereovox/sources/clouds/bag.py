@@ -67,7 +67,7 @@ class BagClouds(CloudSource):
         self.name, self.lidar = f"{Path(path).name} {topic}", self._options.lidar
         options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame, axes="optical")
         self._poses, self._missing, notes = read_poses(self._file, options, self._scans.frame_id)
-        self.notes = (*self._file.notes, *notes, *self._note_of_times())
+        self.notes = (*self._file.notes, *notes, *self._note_of_times(), *self._scans.notes)
         self.posed = self._poses is not None
 
     @classmethod

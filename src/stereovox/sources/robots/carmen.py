@@ -25,6 +25,9 @@ from stereovox.sources.poses.poses import Poses
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
 """Line types with a scan of the front laser, and the largest distance in metres of its mount from the robot."""
 NO_ECHO = (50.0, 81.9)
+TOP, GAP, SPIKE, FEWEST = 0.998, 0.75, 0.005, 20
+"""Other marks of "no echo" are within 0.2 % of the largest range of a log; this share of its beams, and so many of them
+at least, are there, and not one between three quarters of that range and it."""
 MAX_DISTANCE = 1e6
 """Metres from the world's origin within which a robot can be."""
 MAX_BEAMS = 100_000
@@ -246,9 +249,19 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
 
 
 def _no_echo(readings: list[Reading]) -> float:
-    """Return the range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
-    largest = max(float(np.max(reading.ranges, initial=0.0, where=np.isfinite(reading.ranges))) for reading in readings)
-    return min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=NO_ECHO[-1])
+    """Return the range from which on a laser means "no echo".
+
+    It is the largest range of the log if many beams have it and none lies just below it; else one of the two
+    conventions of a SICK that is a peak in the log.
+    """
+    ranges = np.concatenate([reading.ranges for reading in readings])
+    ranges = ranges[np.isfinite(ranges)]
+    largest = float(ranges.max(initial=0.0))
+    known = min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=0.0)
+    if known:
+        return known
+    top, below = int((ranges >= TOP * largest).sum()), int((ranges >= GAP * largest).sum())
+    return TOP * largest if top == below >= max(SPIKE * len(ranges), FEWEST) else NO_ECHO[-1]
 
 
 def _notes(path: Path, damaged: list[str], max_range: float, no_echo: str) -> Iterator[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near the projective integrator comes to exact ray casting with one update a cell a frame.
+"""Agreement of the projective integrator with exact ray casting at one update per cell and frame.
 
 python benchmarks/agreement.py RECORDING [FRAMES] [SENSOR]      for example: recordings/kitchen ::4 stereo
 """

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo localisation in a building of many alike offices: from anywhere, tracking, and after a kidnapping.
+"""Monte Carlo localisation in a building of many similar offices: global, tracking, and after a kidnapping.
 
     python benchmarks/amcl.py [RUNS] [SETTING=VALUE ...]            for example: 100 amcl.model=beam
     python benchmarks/amcl.py floor [RUNS] [SETTING=VALUE ...]      on sim:floor?plan=corridors instead
 
-Each run (seeds 0, 1, ...) drives its own way of 40 m through corridors and offices with a lidar of 240 degrees and
-5.6 m (noise 1 cm, 2 % of the beams lost, 5 % blocked by things that are not in the map) and an odometer that is off by
-a few per cent. `found`: within 0.2 m of the truth over the last 5 m of the way. `way to`: metres after which it stayed
-so. `rms`: error once found. Kidnapped: after 20 m of tracking the robot is put somewhere else, unnoticed.
-Times are those of the processor, for scans that were compared with the map.
+Each run (seeds 0, 1, ...) drives its own path of 40 m through corridors and offices with a lidar of 240 degrees and
+5.6 m (noise 1 cm, 2 % of the beams lost, 5 % blocked by objects missing in the map) and an odometer that is off by a
+few per cent. `found`: within 0.2 m of the truth over the last 5 m of the path. `way to`: metres until it stayed so.
+`rms`: error once found. Kidnapped: after 20 m of tracking the robot is moved elsewhere, unnoticed.
+Times are processor times, for scans that were compared with the map.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from stereovox.simulate.floors.view import cast
 
 REACH, WAY, STEP, TURN = 5.6, 40.0, 0.1, 0.25
 ANGLES = np.radians(np.arange(-120, 120.1, 1.44))
-"""A fourth of the beams of a lidar with 0.36 degrees between them: sixty are used."""
+"""A quarter of the beams of a lidar with 0.36 degrees between them: sixty are used."""
 MOUNT = (0.1, 0.0, 0.0)
 NEAR = 0.2
 
@@ -55,21 +55,21 @@ def building() -> FloorPlan:
 
 
 def into(office: tuple[float, int]) -> list[tuple[float, float]]:
-    """Return the places from the corridor to the middle of an office."""
+    """Return the waypoints from the corridor to the middle of an office."""
     x, side = office
     inner, middle = ((4.2, 2.8), (14.6, 15.9))[side]
     return [(x + 0.95, CORRIDORS[side]), (x + 0.95, inner), (x + 2.6, middle)]
 
 
 def between(a: tuple[float, int], b: tuple[float, int]) -> list[tuple[float, float]]:
-    """Return the places on the way from one office to another."""
+    """Return the waypoints from one office to another."""
     cross = min(CROSSINGS, key=lambda x: abs(x - a[0]) + abs(x - b[0]))
     over = [] if a[1] == b[1] else [(cross, CORRIDORS[a[1]]), (cross, CORRIDORS[b[1]])]
     return [*into(a)[::-1], *over, *into(b)]
 
 
 def drive(start: tuple[float, int], length: float, rng: np.random.Generator) -> np.ndarray:
-    """Return true poses (N, 3) from office to office: straight ways in steps of STEP, turns on the spot by TURN."""
+    """Return true poses (N, 3) from office to office: straight segments in steps of STEP, turns in place by TURN."""
     poses, done, here = [], 0.0, start
     heading = rng.uniform(-np.pi, np.pi)
     while done < length:
@@ -92,12 +92,12 @@ def drive(start: tuple[float, int], length: float, rng: np.random.Generator) -> 
 
 
 def way_of(poses: np.ndarray) -> np.ndarray:
-    """Return how far the robot has come at each of (N, 3) poses."""
+    """Return the distance travelled at each of (N, 3) poses."""
     return np.concatenate([[0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
 def odometry(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return what an odometer makes of true poses: scales off by 2 % (way) and 3 % (turn), noise, drift."""
+    """Return odometry from true poses: scale errors of 2 % (distance) and 3 % (turn), noise, drift."""
     wheel, gyro, drift = rng.normal(0, (0.02, 0.03, np.radians(0.3)))
     steps = se2.relative(poses[:-1], poses[1:])
     way = np.hypot(steps[:, 0], steps[:, 1])[:, None]
@@ -111,7 +111,7 @@ def odometry(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def scan(walls: np.ndarray, pose: np.ndarray, odom: np.ndarray, stamp_ns: int, rng: np.random.Generator) -> Scan:
-    """Return what the lidar sees from a true pose, and where the odometer says that it was."""
+    """Return the lidar scan from a true pose, with the odometer's pose."""
     x, y, yaw = se2.compose(pose, MOUNT)
     ranges = cast(walls, (x, y), ANGLES + yaw, REACH)
     ranges = ranges + rng.normal(0, 0.01, len(ranges))
@@ -124,7 +124,7 @@ def scan(walls: np.ndarray, pose: np.ndarray, odom: np.ndarray, stamp_ns: int, r
 
 
 def run(seed: int, plan: FloorPlan, grid: OccupancyGrid, config: Config, kidnap: bool) -> dict:
-    """Return what came of one drive."""
+    """Return the figures of one drive."""
     rng = np.random.default_rng(seed)
     walls = plan.outline(0.2, 0.4)
     poses = drive(OFFICES[rng.integers(len(OFFICES))], WAY, rng)
@@ -154,7 +154,7 @@ def judged(errors: np.ndarray, poses: np.ndarray, spent: list, settled: np.ndarr
 
 
 def on_floor(runs: int, config: Config) -> None:
-    """Localise on the simulated floor after IST 2019: from its start, and from anywhere on its way on."""
+    """Localise on the simulated floor after IST 2019: from its start, and globally from points along its path."""
     floor = Floor("sim:floor?plan=corridors")
     scans = list(floor.scans[::2])
     poses = np.array([se2.flattened(floor.truth.at(scan.stamp_ns)) for scan in scans])
@@ -168,7 +168,7 @@ def on_floor(runs: int, config: Config) -> None:
 
 
 def followed(localiser: Localiser, scans: list[Scan], poses: np.ndarray, since: int | None = None) -> dict:
-    """Return what comes of scans from (N, 3) true poses; judged by the last `since` of them (all)."""
+    """Return the figures for scans from (N, 3) true poses, judged by the last `since` of them (all)."""
     errors, spent, settled = [], [], []
     for scan, pose in zip(scans, poses, strict=True):
         start = thread_time()

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many good clouds and scans are refused by themselves, and how many bad ones?
+"""Share of good and of bad clouds and scans that are refused on their own.
 
     python benchmarks/bad_clouds.py [--seeds 3,4] [--data FOLDER] [--noise 0,0.02,0.05] [--json]
 
 Good: the lidar's clouds and the 2-D scans of recordings in FOLDER (KITTI raw and stereo 2015, CARMEN logs), also with
 only each 5th or 50th point; clouds of lidars of several patterns in simulated scenes, and in thickets of leaves; scans
 of simulated floors. Bad: the same in millimetres, with ranges at random, and points at random in boxes. Nothing is
-mapped: how frames agree with each other and with the map is not asked.
+mapped: agreement of frames with each other and with the map is not checked.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def simulated(seed: int, noises: list[float]) -> Iterator[tuple[str, np.ndarray]
 
 
 def thickets(seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield clouds of a meadow with bushes, in which a ray goes on average 0.2 or 0.5 m until it meets a leaf."""
+    """Yield clouds of a meadow with bushes, in which a ray travels on average 0.2 or 0.5 m before it hits a leaf."""
     rng = np.random.default_rng(seed)
     for way in (0.2, 0.5):
         for pattern in PATTERNS:
@@ -126,7 +126,7 @@ def bad_scans(scan: Scan, rng: np.random.Generator) -> Iterator[tuple[str, Scan]
 
 
 def count(found: Found, name: str, seen: sv.Cloud | Scan) -> None:
-    """Count one more cloud or scan, and the reason of its refusal ("": accepted)."""
+    """Count a cloud or scan, and the reason of its refusal ("": accepted)."""
     reason = ""
     try:
         (checked_cloud if isinstance(seen, sv.Cloud) else checked_scan)(seen, CONFIG)

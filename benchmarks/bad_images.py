@@ -5,12 +5,12 @@
                                     [--set key=value ...] [--json]
     python benchmarks/bad_images.py --last 1 4 20 [--seeds 0:3] [--clouds] [--set key=value ...] [--json]
 
-All frames of SOURCE are mapped one by one. Before every N-th of them each kind of bad frame is offered in its place, to
-the map as it is then, and taken back. One that is not refused is harmless where it changes the state of less than 0.1 %
-of the sure cells it says something of, and frees no occupied one; what the true frame would do as well does not count.
+All frames of SOURCE are mapped one by one. Before every N-th of them each kind of bad frame is offered instead, to the
+map as it is then, and undone. An accepted one is harmless if it changes the state of less than 0.1 % of the certain
+cells on which it has evidence, and frees no occupied one; changes that the true frame also makes do not count.
 
-With --last, frames are bad for so many seconds, or the world is another one from a moment on: how much of it does the
-map believe, and when? Each seed is a hall at random (`stereovox_lab.checks.lasting`).
+With --last, frames are bad for this many seconds, or the world changes from some moment on: how much of it does the
+map accept, and when? Each seed is a random hall (`stereovox_lab.checks.lasting`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def lasting(wanted: argparse.Namespace) -> None:
-    """Print, for each hall, what became of lasting faults and of changes."""
+    """Print, for each hall, the effect of lasting faults and of changes."""
     begin, end = map(int, wanted.seeds.split(":"))
     rows = []
     for seed in range(begin, end):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map in boxes that is too large to load: time to open it, to ask about a part of it, and to show the whole; memory.
+"""A map in boxes that is too large to load: time to open it, to query a part, and to show the whole; memory.
 
     python benchmarks/boxed_map.py [--boxes 60] [--at FOLDER]
 
-The map is made up: boxes of 256 x 256 x 256 cells of 0.05 m side by side, all cells known, a tenth of the blocks with
-noise and a floor, the others as free as can be. It lies on an S3 server (moto) in a process of its own on this machine,
-or with --at in a folder. Questions are asked by a process that has asked nothing before.
+The map is synthetic: boxes of 256 x 256 x 256 cells of 0.05 m side by side, all cells known, a tenth of the blocks with
+noise and a floor, the others as free as possible. It is on an S3 server (moto) in its own process on this machine, or
+with --at in a folder. Queries are made by a fresh process.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 class server:  # noqa: N801 - a context
-    """A moto server in a process of its own; the usual variables name it."""
+    """A moto server in its own process; the usual variables name it."""
 
     def __enter__(self) -> str:
         with socket.socket() as free:
@@ -84,7 +84,7 @@ class server:  # noqa: N801 - a context
 
 
 class no_server:  # noqa: N801 - a context
-    """Nothing, where the map lies in a folder."""
+    """Nothing, if the map is in a folder."""
 
     def __enter__(self) -> str:
         return ""
@@ -94,7 +94,7 @@ class no_server:  # noqa: N801 - a context
 
 
 def make(place: Place, boxes: int) -> tuple[int, int]:
-    """Write a made-up map; return its number of known cells and its bytes."""
+    """Write a synthetic map; return its number of known cells and its bytes."""
     layout = BoxLayout(sv.load_config("default", voxel_size=0.05), SIDE)
     rules, random, across = layout.rules, np.random.default_rng(0), int(np.ceil(boxes**0.5))
     side = SIDE // 8
@@ -118,7 +118,7 @@ def make(place: Place, boxes: int) -> tuple[int, int]:
 
 
 def asked(name: str) -> dict[str, float]:
-    """Return what opening and asking takes."""
+    """Return the cost of opening and querying."""
     random, result, before = np.random.default_rng(1), {}, peak_mb()
     started = perf_counter()
     city = sv.load_map(name)
@@ -142,7 +142,7 @@ def asked(name: str) -> dict[str, float]:
 
 
 def peak_mb() -> float:
-    """Return the most memory that this process has held so far."""
+    """Return the peak memory of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build other mapping libraries for `stereovox bench`, each with a small adapter of ours (benchmarks/peers/*.cpp).
+"""Build other mapping libraries for `stereovox bench`, each with a small adapter (benchmarks/peers/*.cpp).
 
     python benchmarks/build_peers.py FOLDER --out BUILT [--march x86-64-v3] [NAME ...]
     STEREOVOX_PEERS=BUILT stereovox bench RECORDING --peers octomap-cpp,bonxai,ufomap,wavemap-cpp
 
 FOLDER holds checkouts of any of OctoMap/octomap, facontidavide/Bonxai, UnknownFreeOccupied/ufomap and ethz-asl/wavemap,
-in folders of these names. What they need next to a compiler, on Debian: libeigen3-dev (Bonxai, wavemap),
-libgoogle-glog-dev and libboost-dev (wavemap), liblz4-dev and libtbb-dev (UFOMap). Nothing of theirs becomes part of
+in folders of these names. Dependencies besides a compiler, on Debian: libeigen3-dev (Bonxai, wavemap),
+libgoogle-glog-dev and libboost-dev (wavemap), liblz4-dev and libtbb-dev (UFOMap). None of their code becomes part of
 stereovox.
 """
 
@@ -24,12 +24,12 @@ from pathlib import Path
 ADAPTERS = Path(__file__).with_name("peers")
 OPTIMISED = ("-O3", "-DNDEBUG", "-std=c++17", "-fPIC", "-w")
 ERROR_LINES = 6
-"""So many lines of what a compiler says about an error."""
+"""Most lines shown of a compiler error."""
 
 
 @dataclass(frozen=True)
 class Library:
-    """A library to build: its adapter, the folder of its checkout, and in that its headers and sources (globs)."""
+    """A library to build: its adapter, the folder of its checkout, and the headers and sources in it (globs)."""
 
     adapter: str
     folder: str
@@ -86,15 +86,15 @@ LIBRARIES = {
         libraries=("-lglog",),
     ),
 }
-"""By the name of the peer."""
+"""By name of the peer."""
 
 
 class CannotBuildError(Exception):
-    """A library is not there or its compiler failed; the text is for people."""
+    """A library is missing or its build failed; the text is for people."""
 
 
 def main() -> int:
-    """Build what is asked for, or all; return how many could not be built."""
+    """Build the requested libraries, or all; return the number of failures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="holds the libraries' checkouts")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(LIBRARIES)} (all of them)")

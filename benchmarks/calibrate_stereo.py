@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near `stereovox calibrate stereo` comes to the truth next to OpenCV's stereoCalibrate, on simulated chessboards.
+"""Accuracy of `stereovox calibrate stereo` against OpenCV's stereoCalibrate, on simulated chessboards.
 
-Both are given the same corners and drop pairs that do not fit by the same rule. Cameras, boards and noise differ with
-each seed. OpenCV has a fisheye tried at each focal length that `fit_stereo` tries, and keeps the best.
-Errors: rows of fresh boards after rectification, where the lens found sees them, and the right eye's place.
+Both get the same corners and drop pairs that do not fit by the same rule. Cameras, boards and noise differ with each
+seed. OpenCV's fisheye is started from each focal length that `fit_stereo` tries, and the best result counts.
+Errors: rows of fresh boards after rectification, where the estimated lens sees them, and the right eye's pose.
 
 python benchmarks/calibrate_stereo.py [SEEDS]
 """
@@ -44,11 +44,11 @@ FLAGS = {
 }
 UNTIL = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-9)
 Found = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray, list[Transform]]
-"""Camera matrix and distortion of both eyes, R and t of the right one as OpenCV means them, and T_left_board."""
+"""Camera matrix and distortion of both eyes, R and t of the right one in OpenCV's convention, and T_left_board."""
 
 
 def eyes_of(model: str, rng: np.random.Generator) -> Eyes:
-    """Two lenses of one make and their places."""
+    """Two lenses of one make and their poses."""
 
     def lens() -> Lens:
         cx, cy = np.array(SIZE) / 2 + rng.uniform(-12, 12, 2)
@@ -100,7 +100,7 @@ def inside(lens: Lens, corners: np.ndarray) -> bool:
 def pairs_of(
     eyes: Eyes, rng: np.random.Generator, noise: float, views: int = 12, wrong_corners: float = 0.0, moved: int = 0
 ) -> list[BoardPair]:
-    """Corners as they are found: noise in pixels, some corners far off, some boards moved between both images."""
+    """Corners as detected: noise in pixels, some corners far off, some boards moved between both images."""
     pairs = []
     for k, T in enumerate(boards_of(eyes, views, rng)):
         left, right = (seen + noise * rng.normal(size=seen.shape) for seen in corners_of(eyes, T))
@@ -137,7 +137,7 @@ def _pinholes(size: tuple[int, int], board: np.ndarray, left: Corners, right: Co
 
 
 def _fisheyes(size: tuple[int, int], board: np.ndarray, left: Corners, right: Corners) -> Found:
-    """Begin where OpenCV would and at the focal lengths that `fit_stereo` tries: alone it often begins too far off."""
+    """Start where OpenCV would and at the focal lengths that `fit_stereo` tries: its own start is often too far off."""
     flags = FLAGS["CALIB_FIX_SKEW"] | FLAGS["CALIB_RECOMPUTE_EXTRINSIC"]
     points = [board[None]] * len(left)
     a, b = ([corners[None].astype(float) for corners in many] for many in (left, right))
@@ -177,7 +177,7 @@ def _lens(model: str, size: tuple[int, int], K: np.ndarray, distortion: np.ndarr
 
 
 def errors(found: Eyes, true: Eyes, rng: np.random.Generator) -> list[float]:
-    """Return the RMS by which rows of fresh boards differ (px), and the right eye's place (mm) and turn (deg)."""
+    """Return the RMS row difference on fresh boards (px), and the right eye's position (mm) and turn (deg)."""
     fresh = [corners_of(true, T) for T in boards_of(true, 40, rng)]
     rows = np.concatenate([epipolar_errors(found, left, right) for left, right in fresh])
     T = inverse(true.T_left_right) @ found.T_left_right

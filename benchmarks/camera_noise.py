@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth camera gets wrong, measured on flat patches of any recording or simulation: real and simulated alike.
+"""Errors of a depth camera, measured on flat patches of any recording or simulation.
 
     python benchmarks/camera_noise.py RECORDING [--frames ::10] [--baseline 0.075] [--colour] [--json]
 
-No truth is needed. Images are cut into squares of 24 pixels; where nearly all depths of a square lie on a plane (which
-is linear in disparity), what they are off is noise: its size, how alike it is in neighbouring pixels and in the next
-frame, in which steps it comes. How many pixels of such a square have no value tells about holes, by range, angle and
-brightness. Stereo pairs are matched here first. `--baseline` is for recordings that do not say it (a Kinect: 0.075).
-`--colour` takes the brightness from the colour images of `sevenscenes_30hz`.
+No truth is needed. Images are cut into squares of 24 pixels; if nearly all depths of a square are on a plane (which is
+linear in disparity), their deviations are noise: its size, its correlation between neighbouring pixels and frames, and
+its quantisation. Missing values in such squares show holes, by range, angle and brightness. Stereo pairs are matched
+here first. `--baseline` is for recordings without one (a Kinect: 0.075). `--colour` takes the brightness from the
+colour images of `sevenscenes_30hz`.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ SIDE = 24
 """Pixels across a square."""
 LAGS = 12
 BLOCK = 8
-"""Pixels across the blocks whose mean reports how many independent looks they hold."""
+"""Pixels across the blocks whose means give the number of independent looks."""
 MIN_KNOWN, MIN_FLAT, MAX_SIGMA, CURVED = 0.3, 0.9, 1.0, 0.85
-"""A square counts with this share of values, that share of them on a plane, less noise than this in pixels, and a
-quadratic surface that leaves at least this share of the plane's residual: else it is curved."""
+"""A square counts with this share of values, this share of them on a plane, less noise than this in pixels, and a
+quadratic fit that leaves at least this share of the plane's residual; otherwise it is curved."""
 GROSS_PX = 1.0
 """A value this far off its plane, and five sigma, is a gross error."""
 GAP_PX, SUPPORT, BETWEEN = 2.0, (3, 5), 2
-"""An edge: both sides, so many pixels away, differ by more than GAP_PX; the pixels BETWEEN either side are judged."""
+"""An edge: both sides, SUPPORT pixels away, differ by more than GAP_PX; the pixels BETWEEN them are judged."""
 MOVED_PX = (3.0, 40.0)
-"""Frames are compared where the image moved so far: there the same place is another pixel."""
+"""Frames are compared if the image moved this far: then the same place is another pixel."""
 RANGES = (0.0, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 50.0)
 ANGLES = (0.0, 20.0, 40.0, 60.0, 70.0, 80.0, 90.0)
 GREYS = (0.0, 16.0, 32.0, 64.0, 128.0, 192.0, 256.0)
@@ -58,7 +58,7 @@ class Square:
 
     row, column: its first pixel. z: depth of its middle in metres; angle_deg: between its normal and the ray there.
     sigma_px: noise of its disparity. residual (SIDE, SIDE) in pixels, NaN: no value or a gross error. known, gross:
-    shares of pixels with a value, and of these of gross errors. grey: mean brightness, NaN if it is not known.
+    shares of pixels with a value, and of these of gross errors. grey: mean brightness, NaN if unknown.
     """
 
     row: int
@@ -86,7 +86,7 @@ class Seen:
 
 
 def measure(frames: Iterator[tuple[Frame, NDArray | None]], baseline: float) -> dict[str, Any]:
-    """Return all figures of frames, each with its grey image (None: not known); baseline: where cameras have none."""
+    """Return all figures of frames, each with its grey image (None: unknown); baseline: for cameras without one."""
     seen, last = Seen(), None
     for frame, grey in frames:
         px_m = frame.camera.focal_px * (frame.camera.baseline or baseline)
@@ -146,13 +146,13 @@ def flat_squares(disparity: NDArray, camera: Any, px_m: float, grey: NDArray | N
 
 
 def mean_of(values: NDArray) -> float:
-    """Return the mean of those that are known, NaN if none is."""
+    """Return the mean of known values, NaN if there are none."""
     known = np.isfinite(values)
     return float(values[known].mean()) if known.any() else np.nan
 
 
 def on_plane(values: NDArray) -> tuple[NDArray, NDArray[np.bool_]] | None:
-    """Return the plane (3,) of a square's disparities and which lie on it; None if they are on none."""
+    """Return the plane (3,) of a square's disparities and its inliers; None if they are on no plane."""
     known = np.isfinite(values)
     if known.mean() < MIN_KNOWN:
         return None
@@ -173,7 +173,7 @@ def on_plane(values: NDArray) -> tuple[NDArray, NDArray[np.bool_]] | None:
 
 
 def add_correlation(seen: Seen, square: Square) -> None:
-    """Add products of residuals, in sigmas, `lag` pixels apart along rows and columns, and how many there are."""
+    """Add products of residuals, in sigmas, `lag` pixels apart along rows and columns, and their number."""
     if square.sigma_px <= 1e-4:
         return
     values = np.nan_to_num(square.residual / square.sigma_px)
@@ -187,7 +187,7 @@ def add_correlation(seen: Seen, square: Square) -> None:
 
 
 def edge_counts(disparity: NDArray) -> NDArray[np.float64]:
-    """Return how many pixels in the middle of edges, along rows, have no value, the near one, the far one, another."""
+    """Count the pixels in the middle of edges, along rows, with no value, the near one, the far one, another."""
     first, last = SUPPORT
     width = disparity.shape[1]
     middle = np.s_[last : width - last]
@@ -279,9 +279,9 @@ def figures(seen: Seen) -> dict[str, Any]:
 
 
 def looks(squares: list[Square]) -> float | None:
-    """Return how many independent pixels would make the means of 8x8 blocks as noisy as they are.
+    """Return the number of independent pixels that would make the means of 8x8 blocks equally noisy.
 
-    The plane fitted to the square takes out a little of the blocks' noise as well.
+    The plane fitted to the square also removes a little of the blocks' noise.
     """
     means = []
     for square in squares:
@@ -292,7 +292,7 @@ def looks(squares: list[Square]) -> float | None:
 
 
 def common_step(steps: NDArray) -> tuple[float, float]:
-    """Return the commonest difference between neighbours that differ, in pixels, and its share (within a tenth)."""
+    """Return the most common difference between differing neighbours, in pixels, and its share (within a tenth)."""
     if not steps.size:
         return 0.0, 0.0
     counts, borders = np.histogram(steps, bins=250, range=(0, 1))
@@ -301,7 +301,7 @@ def common_step(steps: NDArray) -> tuple[float, float]:
 
 
 def falls_to(line: NDArray, level: float) -> float:
-    """Return the lag at which a correlation falls to `level`, inf where it does not."""
+    """Return the lag at which a correlation falls to `level`, inf if it does not."""
     below = np.flatnonzero(line < level)
     if not below.size or below[0] == 0:
         return float("inf") if not below.size else 0.0
@@ -310,7 +310,7 @@ def falls_to(line: NDArray, level: float) -> float:
 
 
 def by(squares: list[Square], values: list[float], borders: tuple[float, ...]) -> list[dict[str, float]]:
-    """Return for each class of `values` the squares' number, noise, and share of pixels without value."""
+    """Return, for each class of `values`, the squares' number, noise, and share of pixels without value."""
     table, place = [], np.digitize(values, borders)
     for i in range(1, len(borders)):
         some = [square for square, at in zip(squares, place, strict=True) if at == i]
@@ -332,7 +332,7 @@ def depth_frames(recording: str, frames: str | None, colour: bool) -> Iterator[t
 
 
 def registered_grey(frame: Frame, folder: Path) -> NDArray[np.float64]:
-    """Return the colour image of `sevenscenes_30hz` as grey (height, width) where the depth image has depth, else NaN.
+    """Return the colour image of `sevenscenes_30hz` as grey (height, width) if the depth image has depth, else NaN.
 
     By the model in the recording's README.
     """

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of a lidar: time a cloud and how well a held-out one is foretold, next to other libraries on the same points.
+"""Lidar clouds: time per cloud and prediction of held-out ones, against other libraries on the same points.
 
     python benchmarks/clouds.py 'DRIVE?sensor=velodyne' [--voxel-size 0.2] [--max-range 60] [--every 5] [--frames A:B:S]
         [--peers octomap octomap-cpp wavemap-cpp] [--rounds 3] [setting=value ...]
 
-Each map is made of all clouds but every fifth. Time: of the library's own call, the median over clouds of the best of
-some rounds, each beginning with an empty map; one thread, and two for stereovox. Libraries in C++ are those of
-`benchmarks/build_peers.py` (STEREOVOX_PEERS), with the points in their own types before the clock starts; wavemap has
-an HDL-64's 64 x 2048 beams, from -24.9 to 2 degrees. Foretold: of the points held out, the
-share in cells that are occupied, or within a cell of one; of places along their rays, at least two cells before the
-point and a metre from the sensor, the shares that are free, unknown and (wrongly) occupied. kiss-icp's map keeps points
-and knows nothing of free space; where it is installed, its time stands beside, as do those of libraries in C++ whose
-adapters cannot be asked.
+Each map is made from all clouds except every fifth. Time: of the library's own call, the median over clouds of the best
+of some rounds, each starting with an empty map; one thread, and two for stereovox. Libraries in C++ are built by
+`benchmarks/build_peers.py` (STEREOVOX_PEERS), with the points in their own types before timing starts; wavemap has an
+HDL-64's 64 x 2048 beams, from -24.9 to 2 degrees. Predicted: of the held-out points, the share in occupied cells, or
+within a cell of one; of places along their rays, at least two cells before the point and a metre from the sensor, the
+shares that are free, unknown and (wrongly) occupied. kiss-icp's map keeps points without free space; if it is
+installed, only its time is listed, as for C++ libraries whose adapters cannot be queried.
 """
 
 import argparse
@@ -40,7 +39,7 @@ SEED = 0
 HDL_64 = float(np.radians(-24.9)), float(np.radians(2.0)), 64, 2048
 """Lowest and highest beam, beams above each other, and directions of a turn at 10 Hz."""
 Insert = Callable[[Cloud], Callable[[], object]]
-"""Returns the call that inserts a cloud, which is what is timed."""
+"""Returns the timed call that inserts a cloud."""
 Ask = Callable[[NDArray[np.float64]], NDArray[np.uint8]]
 
 
@@ -105,7 +104,7 @@ def in_world(cloud: Cloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def foretold(clouds: list[Cloud], ask: Ask, size: float, max_range: float) -> dict[str, float]:
-    """Return how well clouds that are not in a map are known to it."""
+    """Return how well a map predicts clouds that are not in it."""
     random, found = np.random.default_rng(SEED), {"hit": [], "near": [], "free": [], "unknown": [], "occupied": []}
     around = np.array(list(product((-1, 0, 1), repeat=3))) * size
     for cloud in clouds:
@@ -128,7 +127,7 @@ def foretold(clouds: list[Cloud], ask: Ask, size: float, max_range: float) -> di
 
 
 def timed(make: Callable[[], Insert], clouds: list[Cloud], rounds: int) -> float:
-    """Return the median over clouds of the least milliseconds of some rounds."""
+    """Return the median over clouds of the least milliseconds over rounds."""
     took = np.empty((rounds, len(clouds)))
     for row in took:
         insert = make()

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections of poses: how long until the map is right again, whether it is that of a new run, what kept frames take.
+"""Pose corrections: time until the map is right again, equality with a new run, cost of kept frames.
 
     python benchmarks/correct.py RECORDING [--moved 100] [--voxel-size 0.05] [--runs 20] [--frames A:B:S] [--set ...]
 
 Maps a recording with `map.keep_frames` and two threads. Random rotations (sigma 1 degree) and shifts (10 cm) move the
 poses of `--moved` frames, or of all, `--runs` times with different seeds. Frames are offered again at 30 Hz while poses
-are corrected, each with a stamp of its own.
+are corrected, each with its own stamp.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def mapped(frames: Sequence[Any], settings: dict[str, Any], keep: bool = True) -
 
 
 def tell_memory(frames: Sequence[Any], settings: dict[str, Any]) -> None:
-    """Print what keeping frames costs, in time and in bytes."""
+    """Print the cost of keeping frames, in time and in bytes."""
     seconds = {}
     for keep in (False, True, False, True):
         start = perf_counter()
@@ -87,7 +87,7 @@ def shaken(frames: Sequence[Any], moved: int, seed: int) -> tuple[list[Any], dic
 
 
 def correct_some(frames: Sequence[Any], moved: int, runs: int, settings: dict[str, Any], what: str) -> None:
-    """Correct a map again and again, and compare it each time with a new one."""
+    """Correct a map repeatedly, and compare it each time with a new one."""
     mapper, seconds, differing, known = mapped(frames, settings), [], 0, 0
     first = {frame.stamp_ns: frame.T_world_sensor for frame in frames}
     for seed in range(runs):
@@ -115,7 +115,7 @@ def different_cells(a: sv.VoxelMap, b: sv.VoxelMap) -> int:
 
 
 def correct_live(frames: Sequence[Any], settings: dict[str, Any]) -> None:
-    """Correct all poses while frames come at 30 Hz; print how late these were."""
+    """Correct all poses while frames arrive at 30 Hz; print how late they were mapped."""
     mapper, late, done = mapped(frames, settings), [], threading.Event()
     last_ns = max(frame.stamp_ns for frame in frames)
 

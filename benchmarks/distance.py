@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long the distance field of a window takes: made anew, and brought up to date after each frame; next to SciPy.
+"""Time of a window's distance field: built from scratch, and updated after each frame; against SciPy.
 
     python benchmarks/distance.py RECORDING [FRAMES] [--voxel-size 0.05] [--size 10,3,10] [--json]
 
-SciPy, and edt where it is installed, make the same field anew. Milliseconds of CPU, of all threads together, with one
-thread, and of wall clock with two; medians of all frames (made anew, the others: of some). Where other programs run,
-CPU and the ratios say more.
+SciPy, and edt if it is installed, build the same field from scratch. Milliseconds of CPU, of all threads together, with
+one thread, and of wall clock with two; medians of all frames (for builds from scratch: of some). If other programs run,
+CPU and the ratios are more reliable.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long do ghosts stay, and does a thin pole stay that is often missed? Four models next to each other.
+"""How long do ghosts remain, and does a thin pole that is often missed remain? A comparison of four models.
 
     python benchmarks/dynamic.py [--voxel-size 0.1] [--width 424] [--pole 0.03] [--missed background|unmatched] [--json]
                                  [--picture dynamic.png]
 
-A person walks across the view of a simulated D435 that stands, 30 frames a second, and is gone. Behind: a wall within
-range; nothing, and the camera says so; nothing, and the camera does not say why it has no value. A pole next to the way
-is measured in one frame of three; in the others it has no value, or what is behind it shows.
+A person walks across the view of a simulated static D435, 30 frames a second, and leaves. Behind: a wall within range;
+nothing, reported as such by the camera; nothing, without a reason for the missing value. A pole next to the path is
+measured in one frame of three; in the others it has no value, or shows the background.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def shown(value: float | None) -> str:
 
 
 def draw(found: dict[str, dict[str, Ghosts]], path: Path) -> None:
-    """Draw how many ghosts there are against time, one chart for each background."""
+    """Draw the number of ghosts against time, one chart for each background."""
     from stereovox.view.figures import blank, labels, png_of
 
     figure = blank(7, 6)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps made by a fleet: whether they are those of one mapper, and how fast they are made.
+"""Maps made by a fleet: equality with one mapper's map, and speed.
 
     python benchmarks/fleet.py same RECORDING... [--boxes 3.2 6.4 12.8] [--workers 1 2 4] [--kills 20] [--set KEY=VALUE]
     python benchmarks/fleet.py speed RECORDING... [--boxes 12.8] [--workers 1 2] [--set KEY=VALUE]
 
 same: each map against the frames that each recording's own mapper trusts, put into one map in this process without
-boxes. With --kills one worker after another is killed while boxes are mapped. speed: seconds of a run, the first of
-each number of workers not counted; efficiency is against one worker. Overlap: boxes a frame is in, measured, and by the
-mean of the product of (1 + extent / side) over all axes, where what frames see lies anywhere and fills its extent.
+boxes. With --kills one worker after another is killed while boxes are mapped. speed: seconds of a run, without the
+first for each number of workers; efficiency is against one worker. Overlap: boxes per frame, measured, and predicted by
+the mean of the product of (1 + extent / side) over all axes, for views anywhere that fill their extent.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def same(folder: Path, recordings: Sequence[str], given: argparse.Namespace, settings: dict[str, Any]) -> None:
-    """Compare the maps of fleets with that of one process."""
+    """Compare the maps of fleets with the map of one process."""
     started = perf_counter()
     coords, cells, frames = one_map(recordings, settings)
     print(f"one process: {frames} frames, {len(coords)} blocks, {perf_counter() - started:.1f} s", flush=True)
@@ -71,7 +71,7 @@ def same(folder: Path, recordings: Sequence[str], given: argparse.Namespace, set
 
 
 def one_map(recordings: Sequence[str], settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the blocks of one map of the frames that each recording's own mapper trusts, and their number."""
+    """Return the blocks of one map from the frames that each recording's own mapper trusts, and their number."""
     config = load_config("default", **settings)
     storage, levels, count = sv.VoxelMap(config).storage, Levels(config), 0
     for one in recordings:
@@ -88,7 +88,7 @@ def one_map(recordings: Sequence[str], settings: dict[str, Any]) -> tuple[np.nda
 
 
 class Killer:
-    """Kills a worker that computes, some times, while boxes are mapped."""
+    """Kills busy workers a number of times while boxes are mapped."""
 
     def __init__(self, kills: int):
         self._left, self.killed = kills, 0
@@ -127,7 +127,7 @@ def speed(folder: Path, recordings: Sequence[str], given: argparse.Namespace, se
 
 
 def predicted(place: Place, made: sv.FleetMap) -> float:
-    """Return the overlap by how large what frames see is next to a box."""
+    """Return the overlap predicted from the extent of views relative to a box."""
     keys, extents = {name.split("/")[1] for name in place.names("recordings/")}, []
     for key in keys:
         with frames_of(place, key, range(next(one.frames for one in made.recordings))) as frames:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a fleet grows: what a task costs the scheduler and the client, measured here, and a model to 1,000 workers.
+"""Scaling of a fleet: measured costs of a task for scheduler and client, and a model up to 1,000 workers.
 
     python benchmarks/fleet_model.py [RECORDING] [--frames 1000000] [--recordings 2000] [--box 12.8] [--tasks 2000]
 
-Measured: seconds a frame takes alone and in a box, boxes a frame is in, bytes kept of it; seconds the scheduler takes
-for a task that does nothing, with what a box's task is given; seconds the client takes to find the boxes of frames. The
-model: each step takes as long as the slowest of its work over the workers, its longest task, and what the scheduler or
-the client does one after the other. Frames of all recordings are taken to be like those of RECORDING. Time to read and
-write the store is in it as far as a folder on this machine takes it; the bytes that must pass are printed.
+Measured: seconds per frame alone and in a box, boxes per frame, bytes kept of it; the scheduler's seconds for an empty
+task with a box's inputs; the client's seconds to find the boxes of frames. The model: each step takes as long as the
+slowest of its work over the workers, its longest task, and the serial work of the scheduler or the client. Frames of
+all recordings are assumed to be like RECORDING's. Reading and writing the store is included at the speed of a folder on
+this machine; the bytes to transfer are printed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def measured(recording: str, box_m: float, tasks: int) -> tuple[Costs, float]:
-    """Return the costs, and how many frames a box has."""
+    """Return the costs, and the number of frames per box."""
     with tempfile.TemporaryDirectory() as folder:
         for n in range(2):  # the first one compiles
             made = map_fleet([recording], Path(folder) / str(n), profile="default", box_m=box_m, workers=1)
@@ -97,11 +97,11 @@ def measured(recording: str, box_m: float, tasks: int) -> tuple[Costs, float]:
 
 
 def nothing(*given: object) -> None:
-    """Do nothing, with what a box's task is given."""
+    """Do nothing, with the inputs of a box's task."""
 
 
 def seconds_of_a_task(tasks: Sequence[tuple[Place, sv.Config, Box]]) -> float:
-    """Return the seconds that a task takes which does nothing."""
+    """Return the seconds of an empty task."""
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50) as cluster,
         Client(cluster) as client,
@@ -113,7 +113,7 @@ def seconds_of_a_task(tasks: Sequence[tuple[Place, sv.Config, Box]]) -> float:
 
 
 def model(costs: Costs, frames: int, recordings: int, boxes: int, workers: int) -> list[tuple[str, float, float]]:
-    """Return what is lost to in each step, its seconds, and what they would be with nothing lost."""
+    """Return the bottleneck of each step, its seconds, and the ideal ones."""
     steps = []
     alone, boxed = frames * costs.alone_s, frames * costs.overlap * costs.in_box_s
     for name, work, count in (("the longest recording", alone, recordings), ("the longest box", boxed, boxes)):

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a simulated quadrotor by random sticks through halls at random, with what the map says over MAVLink.
+"""Fly a simulated quadrotor with random stick inputs through random halls, guided by the map over MAVLink.
 
     python benchmarks/flights.py --seeds 0:100 [--without] [--scene sim:...] [--set name=value ...] [--jobs 1] [--json]
 
-Each seed is another hall, start, way of the sticks and noise. A depth camera (15 Hz, a D435's field of view, 212 pixels
-wide) sees ahead; after one turn on the spot the sticks ask for up to 1.5 m/s in any direction for 40 s. The 72 sectors
-of the growing map go to PX4's collision prevention as its documents describe it (`stereovox_lab.flights.px4`) ten times
-a second. Told are collisions (a ball of 25 cm touches a surface), how far it flew, and the least room. `--without`
-flies the same seeds as the sticks say. `--set` changes the `Setup` (`speed=3`, `pose_sigma=[0.02,0.01]`), its rules
-(`rules.half_height=0.2`), the autopilot's parameters (`parameters.cp_dist=0.8`), the airframe (`airframe.radius=0.4`).
+Each seed is another hall, start, stick sequence and noise. A depth camera (15 Hz, a D435's field of view, 212 pixels
+wide) faces ahead; after one turn in place the sticks command up to 1.5 m/s in any direction for 40 s. The 72 sectors of
+the growing map go to PX4's collision prevention as its documents describe it (`stereovox_lab.flights.px4`) ten times a
+second. Reported are collisions (a ball of 25 cm touches a surface), the distance flown, and the least clearance.
+`--without` flies the same seeds without prevention. `--set` changes the `Setup` (`speed=3`, `pose_sigma=[0.02,0.01]`),
+its rules (`rules.half_height=0.2`), the autopilot's parameters (`parameters.cp_dist=0.8`), the airframe
+(`airframe.radius=0.4`).
 
 Margins were chosen on seeds 1000:1040; figures are of 0:100.
 """
@@ -79,7 +80,7 @@ def line(flight: Flight) -> str:
 
 
 def told(flights: list[Flight]) -> dict[str, Any]:
-    """Return what all flights come to."""
+    """Return the summary of all flights."""
     metres = np.array([flight.metres for flight in flights])
     room = np.array([flight.clearance_m for flight in flights])
     return {

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Obstacles that a 2-D grid of a 3-D map calls free, and how much of the free floor it calls free.
+"""Obstacles and free floor that a 2-D grid of a 3-D map calls free.
 
     python benchmarks/floor_obstacles.py [--seeds N] [--first N] [--places N] [--kitchen FOLDER]
 
 Each scene is mapped in a world whose z = 0 is where the camera began. A column is an obstacle if a surface of the scene
-lies 0.1 to 1.8 m above the floor there, at any of 16 places of the column; the true floor is free elsewhere. Columns of
-which the map knows nothing in that band do not count. "Missed" are obstacles of which the map itself has only free
-cells in the band: what the sensor lost, no projection can find. Free floor is what was seen as floor and has no
-obstacle. "before" is the earlier rule: the band from the world's origin, cleared by free cells at any height. The truth
-comes from the planes of the scene's solids and shares no code with the products; that of a recording from the map's own
-occupied cells above a plane fitted to its floor.
+is 0.1 to 1.8 m above the floor there, at any of 16 places of the column; the true floor is free elsewhere. Columns
+unknown to the map in that band are ignored. "Missed" are obstacles of which the map itself has only free cells in the
+band: no projection can find what the sensor lost. Free floor was seen as floor and has no obstacle. "before" is the
+earlier rule: the band from the world's origin, cleared by free cells at any height. The truth is derived from the
+planes of the scene's solids and shares no code with the products; for a recording, from the map's own occupied cells
+above a plane fitted to its floor.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Height = Callable[[NDArray], NDArray]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A scene whose floor lies at `floor(x)` metres, and the camera's poses in it."""
+    """A scene whose floor is at `floor(x)` metres, and the camera's poses in it."""
 
     name: str
     scene: Scene
@@ -152,7 +152,7 @@ def built_in(name: str, frames: int) -> World:
 
 
 def mapped(world: World, camera: str, voxel_size: float, seed: int) -> tuple[sv.VoxelMap, NDArray]:
-    """Map a world in a frame whose origin is where the camera began; return the map and that origin."""
+    """Map a world in a frame with its origin at the camera's start; return the map and that origin."""
     device = _devices()[camera]
     origin = world.poses[0][:3, 3].copy()
     lens = device.camera
@@ -175,7 +175,7 @@ def _devices() -> dict[str, D435]:
 
 @dataclass(frozen=True)
 class Score:
-    """Columns of obstacles and of free floor that count, and how many of each the grid calls free."""
+    """Counted columns of obstacles and of free floor, and how many of each the grid calls free."""
 
     obstacles: int
     called_free: int
@@ -205,7 +205,7 @@ class Truth:
 
 
 def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray, band: tuple[float, float] = BAND) -> Truth:
-    """Return what the columns of a map of a world truly are, as far as the map knows anything of them."""
+    """Return the truth of a map's columns in a world, as far as they are known to the map."""
     side = voxel_map.voxel_size
     low, high = (np.rint(end / side).astype(int) for end in voxel_map.bounds())
     columns = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"), -1)
@@ -232,7 +232,7 @@ def truth_of(voxel_map: sv.VoxelMap, world: World, origin: NDArray, band: tuple[
 
 
 def score(grid: OccupancyGrid, truth: Truth) -> Score:
-    """Count what a grid calls free."""
+    """Count the columns that a grid calls free."""
     free = _state(grid, truth.places) == sv.State.FREE
     wrong = truth.obstacles & free
     return Score(*(int(np.count_nonzero(which)) for which in
@@ -240,7 +240,7 @@ def score(grid: OccupancyGrid, truth: Truth) -> Score:
 
 
 def _through(solid: Solid, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """Return where vertical lines enter and leave a convex solid; bottom above top where they miss it."""
+    """Return the heights at which vertical lines enter and leave a convex solid; bottom above top if they miss it."""
     bottom, top = np.full(len(x), -np.inf), np.full(len(x), np.inf)
     for a, b, c, d in solid.planes:
         rest = d - a * x - b * y
@@ -278,7 +278,7 @@ def before(voxel_map: sv.VoxelMap) -> OccupancyGrid:
 
 
 def kitchen(folder: str) -> None:
-    """Judge grids of a recording that was levelled, and tracked, by its own occupied columns above a plane."""
+    """Judge grids of a levelled, and of a tracked, recording by its own occupied columns above a plane."""
     for name, settings in {"levelled": {"level": True}, "tracked": {"poses": "track"}}.items():
         with TemporaryDirectory() as place:
             found = sv.map_recording(folder, Path(place) / "map.svox", **settings).map

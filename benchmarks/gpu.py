@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graphics card against the processor: whether both make the same map, and the time a frame takes on each.
+"""A graphics card against the processor: equality of the maps, and time per frame on each.
 
     python benchmarks/gpu.py [SOURCE] [FRAMES] [--voxel-sizes 0.05 0.02] [--threads 1 2]
 
-Both are given the same frames, in one run; the first ten, which may compile, do not count. What differs is counted over
-all cells that either knows.
+Both get the same frames, in one run; the first ten, which may compile, do not count. Differences are counted over
+all cells known to either.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def compare(frames: Sequence[sv.Frame], threads: Sequence[int], settings: dict[str, Any]) -> None:
-    """Map frames on both, and print the times of a frame and how many cells differ."""
+    """Map frames on both, and print the times per frame and the number of differing cells."""
     card, on_card = mapped(frames, {**settings, "device": "cuda"})
     told = [f"card {milliseconds(on_card)}"]
     for number in threads:
@@ -49,7 +49,7 @@ def compare(frames: Sequence[sv.Frame], threads: Sequence[int], settings: dict[s
 
 
 def mapped(frames: Sequence[sv.Frame], settings: dict[str, Any]) -> tuple[sv.VoxelMap, list[float]]:
-    """Return the map of frames, and the seconds that each took."""
+    """Return the map of frames, and the seconds per frame."""
     mapper, times = sv.Mapper(**settings), []
     for frame in frames:
         start = perf_counter()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often a recording's depth unit and its up direction are found: generated recordings, all parameters by chance.
+"""How often a recording's depth unit and up direction are found: generated recordings with random parameters.
 
-Each has a scene, an image size, a part of the way, a unit, a layout, noise of depth and poses, and a world that is
-turned in any direction. Right: found and said to be certain. Unsure: said not to be certain. Wrong: silently wrong.
+Each has a scene, an image size, a part of the path, a unit, a layout, noise of depth and poses, and a randomly turned
+world. Right: found and reported as certain. Unsure: reported as uncertain. Wrong: silently wrong.
 
 python benchmarks/guesses.py [RECORDINGS] [SEED]
 """
@@ -28,11 +28,11 @@ SCENES = ("room", "apartment", "aisle?speed=1", "flight?length=60", "box?size=la
 UNITS = (0.001, 0.001, 1 / 5000, 1 / 5000, 1 / 4000, 1 / 6553.5, 1 / 10000, 0.01, 1 / 256, 1.0)
 """Metres per unit; the last stands for floats in metres."""
 MAX_OFF = 15.0
-"""Degrees by which up may be off."""
+"""Largest error of up in degrees."""
 
 
 class Case(NamedTuple):
-    """What a recording was made with."""
+    """Parameters of a generated recording."""
 
     scene: str
     width: int
@@ -43,7 +43,7 @@ class Case(NamedTuple):
 
 
 def make(folder: Path, rng: np.random.Generator) -> Case:
-    """Write a recording and return what it was made with."""
+    """Write a recording and return its parameters."""
     scene, width = str(rng.choice(SCENES)), int(rng.choice([160, 240, 320, 424]))
     mark = "&" if "?" in scene else "?"
     noise = int(rng.random() < 0.7)
@@ -79,7 +79,7 @@ def axes(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def write(path: Path, metres: NDArray[np.floating], unit: float) -> None:
-    """Write an image: 16-bit PNG, or NPY where the unit is a metre."""
+    """Write an image: 16-bit PNG, or NPY if the unit is a metre."""
     if unit == 1:
         np.save(path.with_name(f"{path.name}.npy"), metres.astype(np.float32))
     else:
@@ -113,7 +113,7 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def judge(folder: Path, case: Case) -> tuple[str, str, float]:
-    """Return what was found about the unit and about up, and by how many degrees up is off."""
+    """Return the verdicts on unit and up, and the error of up in degrees."""
     source: Any = open_source(folder)
     found = survey(source)
     right = abs(source.unit.scale / case.unit - 1) < 1e-3

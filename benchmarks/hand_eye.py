@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near `hand_eye` comes to the truth next to OpenCV's calibrateHandEye, on simulated motions.
+"""Accuracy of `hand_eye` against OpenCV's calibrateHandEye, on simulated motions.
 
-OpenCV 5 has no calibrateHandEye: this needs `opencv-python-headless<5`. It wants poses where registration gives motions
-between images, so it is given the motions one behind the other, with the drift that this adds up.
+OpenCV 5 has no calibrateHandEye: this needs `opencv-python-headless<5`. It takes poses, not motions between images as
+registration gives them, so it gets the accumulated motions, with their drift.
 
 python benchmarks/hand_eye.py [SEEDS]
 """

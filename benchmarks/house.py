@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The house from outside: modules, lines, folders, and imports that go in circles.
+"""The code base in figures: modules, lines, folders, and circular imports.
 
     python benchmarks/house.py [ROOT] [--json]
 
-ROOT: the folder of a checkout; without it this one. Imports count wherever they stand in a file, also those by name in
-a registry (`"stereovox.x:Name"`); those for type checkers alone (`if TYPE_CHECKING`) are counted apart. The package's
-own `__init__.py` is left out of circles: it hands names out when they are asked for.
+ROOT: the folder of a checkout; by default this one. Imports count wherever they are in a file, including those by name
+in a registry (`"stereovox.x:Name"`); those for type checkers alone (`if TYPE_CHECKING`) are counted separately. The
+package's own `__init__.py` is left out of circles: it loads names on demand.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def modules_of(package: Path) -> dict[str, Path]:
 
 
 def import_graphs(modules: Mapping[str, Path]) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """Return what each module imports of the others: when it runs, and for type checkers alone."""
+    """Return each module's imports of the others: at run time, and for type checkers alone."""
     real, typed = ({name: set() for name in modules} for _ in range(2))
     for name, path in modules.items():
         tree = ast.parse(path.read_text())
@@ -101,7 +101,7 @@ def _is_for_types(node: ast.AST) -> bool:
 
 
 def _imported(node: ast.AST, package: str, modules: Mapping[str, Path]) -> Iterator[str]:
-    """Yield the modules that one node imports, but for the package's own `__init__.py`."""
+    """Yield the modules that one node imports, except the package's own `__init__.py`."""
     names: list[str] = []
     if isinstance(node, ast.Import):
         names = [name.name for name in node.names]
@@ -116,7 +116,7 @@ def _imported(node: ast.AST, package: str, modules: Mapping[str, Path]) -> Itera
 
 
 def floors_of(rooms: Graph) -> dict[str, int]:
-    """Return how many rooms lie under each one; 0 in a circle, which has no floor."""
+    """Return the number of layers below each room; 0 in a circle, which has no floor."""
     found: dict[str, int] = {}
 
     def floor(room: str) -> int:
@@ -151,7 +151,7 @@ def _reached(start: str, graph: Graph) -> set[str]:
 
 
 def between_rooms(graph: Graph) -> dict[str, set[str]]:
-    """Return what rooms, which are folders and loose modules at the root, import of each other."""
+    """Return the imports between rooms: folders and loose modules at the root."""
     rooms = defaultdict[str, set[str]](set)
     for name, others in graph.items():
         if name != PACKAGE:

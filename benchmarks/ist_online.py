@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The chain of IST 2019 online: a bag of sim:floor is played to the node in real time, next to the same bag offline.
+"""The chain of IST 2019 online: a bag of sim:floor is played to the node in real time, against the same bag offline.
 
 Makes the reference map by SLAM of a first drive, writes the second drive as a bag, maps it offline (`stereovox grid`)
-and by the node (`stereovox ros2`), and compares Eq 7. With --slam the lidar's first drive is played as well, and the
+and by the node (`stereovox ros2`), and compares Eq 7. With --slam the lidar's first drive is also played, and the
 node makes the reference itself.
 
     python benchmarks/ist_online.py                  # the whole drive through the corridors, some 3 minutes
@@ -43,7 +43,7 @@ TARGET = 1.0
 
 
 def prepared(folder: Path, seconds: float, plan: str) -> tuple[Path, Path, Path]:
-    """Return the bag of the mapped drive, that of the first one, and the reference map by SLAM of the latter."""
+    """Return the bag of the mapped drive, the bag of the first one, and the latter's reference map by SLAM."""
     ends = f"&seconds={seconds:g}" if seconds else ""
     first, drive = (f"sim:floor?plan={plan}&seed={seed}{ends}&depth_hz={hz}" for seed, hz in ((1, 0), (2, 5)))
     bags = folder / "first.mcap", folder / "drive.mcap"
@@ -61,7 +61,7 @@ def offline(bag: Path, reference: Path, out: Path) -> float:
 
 
 def online(bag: Path, topics: list[str], rate: float, *options: str) -> dict[str, Any]:
-    """Play a bag to the node; return its report, and the share of a core that it took."""
+    """Play a bag to the node; return its report, and its share of a core."""
     command = [sys.executable, "-m", "stereovox", "ros2", "--profile", "ist2019", "--json", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as node:
         process, began = psutil.Process(node.pid), time.monotonic()

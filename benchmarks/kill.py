@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kill `stereovox map` at random moments (`kill -9`) and see what is left.
+"""Kill `stereovox map` at random moments (`kill -9`) and check what is left.
 
     python benchmarks/kill.py --kills 200 [SOURCE] [--frames :100] [--voxel-size 0.1] [--json]
 
-After each kill the map must open and hold all frames of the last checkpoint, and `--resume` must end with the same
-cells, counts, window and settings as a run that nobody disturbed, and leave nothing else behind. Every second run keeps
-the cells that leave a window in tiles on disk; every seventh frame has a fault and is refused. Checkpoints are made far
-more often than by default, so that many kills fall into one. A moment is any from the first map on the disk to the end
-of the process. Ctrl-C ends the trials and tells what they found.
+After each kill the map must open and contain all frames of the last checkpoint, and `--resume` must end with the same
+cells, counts, window and settings as an undisturbed run, and leave nothing else behind. Every second run keeps cells
+outside the window in tiles on disk; every seventh frame has a fault and is refused. Checkpoints are far more frequent
+than by default, so that many kills hit one. Kills are between the first map on disk and the end of the process. Ctrl-C
+ends the trials and prints the results.
 
 The runs are real processes, forked from this one, which has loaded the kernels for all of them.
 """
@@ -39,7 +39,7 @@ CONTEXT = get_context("fork")
 PLAIN: list[str] = []
 KEEP = ["--set", "window.size=[4, 4, 3]", "--set", "window.trigger=0.3", "--set", "window.outside=keep"]
 REST = 1
-"""Instead of 25: half of the time goes into checkpoints."""
+"""Instead of 25: half of the time is spent on checkpoints."""
 
 
 def command(out: Path, given: Namespace, settings: list[str], *more: str) -> list[str]:
@@ -49,7 +49,7 @@ def command(out: Path, given: Namespace, settings: list[str], *more: str) -> lis
 
 
 def perform(words: list[str], done: Any, saved: Any) -> None:
-    """Run a command in this process; `done` and `saved` tell others how many frames are in the map and on the disk."""
+    """Run a command in this process; `done` and `saved` count the frames in the map and on disk for others."""
     recording.REST = REST
     add, save = Mapper.add, recording.Checkpoints.save
 
@@ -70,7 +70,7 @@ def perform(words: list[str], done: Any, saved: Any) -> None:
 
 
 def started(words: list[str], frames: int = 0) -> tuple[Any, Any, Any]:
-    """Return a process that runs a command on a map of so many frames, and its two counters."""
+    """Return a process that runs a command on a map of `frames` frames, and its two counters."""
     done, saved = CONTEXT.Value("q", frames, lock=False), CONTEXT.Value("q", frames, lock=False)
     process = CONTEXT.Process(target=perform, args=(words, done, saved))
     process.start()
@@ -78,7 +78,7 @@ def started(words: list[str], frames: int = 0) -> tuple[Any, Any, Any]:
 
 
 def contents(out: Path) -> dict[str, Any]:
-    """Return what a map holds, read by a process of its own; `digest` stands for all its cells."""
+    """Return a map's content, read by a separate process; `digest` covers all its cells."""
     reader, writer = CONTEXT.Pipe(duplex=False)
 
     def read() -> None:
@@ -100,21 +100,21 @@ def contents(out: Path) -> dict[str, Any]:
 
     process = CONTEXT.Process(target=read)
     process.start()
-    writer.close()  # or a reader that dies would be waited for without end
+    writer.close()  # else a dying reader would be waited for forever
     found = reader.recv()
     process.join()
     return found
 
 
 def left_over(out: Path) -> list[str]:
-    """Return what lies in and next to a map and belongs to no whole one."""
+    """Return files in and next to a map that belong to no complete one."""
     data = json.loads((out / "manifest.json").read_text())["data"]
     inside = [entry.name for entry in out.iterdir() if entry.name not in (data, "manifest.json")]
     return inside + [entry.name for entry in out.parent.iterdir() if entry != out]
 
 
 def undisturbed(folder: Path, given: Namespace, settings: list[str]) -> tuple[dict[str, Any], float]:
-    """Return what a whole run leaves, and how long it takes from its first map on."""
+    """Return the result of a whole run, and its duration from its first map on."""
     out = folder / "whole" / "map.svox"
     out.parent.mkdir()
     process, _, _ = started(command(out, given, settings))
@@ -129,13 +129,13 @@ def undisturbed(folder: Path, given: Namespace, settings: list[str]) -> tuple[di
 
 
 def wait_for_map(process: Any, out: Path) -> None:
-    """Wait until the first map lies on the disk."""
+    """Wait until the first map is on disk."""
     while process.is_alive() and not (out / "manifest.json").exists():
         time.sleep(0.0005)
 
 
 def trial(out: Path, given: Namespace, settings: list[str], whole: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """Kill one run, look at what is left, go on with it and look again."""
+    """Kill one run, check what is left, resume it and check again."""
     process, done, saved = started(command(out, given, settings))
     wait_for_map(process, out)
     time.sleep(random.uniform(0, seconds))
@@ -192,10 +192,10 @@ def parsed() -> Namespace:
 
 
 def judged() -> int:
-    """Kill and tell; the status is 1 where a promise was broken."""
+    """Kill and report; the status is 1 if a promise was broken."""
     given = parsed()
     random.seed(given.seed)
-    # Loads the kernels for all processes to come. Nothing is read or written with Zarr here: its thread would be lost.
+    # Loads the kernels for all later processes. Zarr is not used here: its thread would be lost.
     for words in ({}, {"window": {"size": [4, 4, 3], "trigger": 0.3}}):
         mapper = Mapper("default", voxel_size=given.voxel_size, **words)
         for frame in open_stream(given.source, given.frames):
@@ -211,7 +211,7 @@ def judged() -> int:
             while len(told) < given.kills:
                 with tempfile.TemporaryDirectory(dir=name) as place:
                     one = trial(Path(place) / "map.svox", given, *kinds[len(told) % 2])
-                if one["killed"]:  # else it had come to its end
+                if one["killed"]:  # else it had already ended
                     told.append(one)
                     print(f"\r{len(told)} of {given.kills}", end="", file=sys.stderr, flush=True)
     found = summary(told, time.monotonic() - start)

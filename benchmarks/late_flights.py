@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is what an autopilot hears true when it is sent, although images and poses come up to 5 s late?
+"""Are messages to an autopilot true when sent, although images and poses arrive up to 5 s late?
 
     python benchmarks/late_flights.py [--seeds 0:1000] [--arrival] [--json]
 
-Each seed is another hall with pillars, way, number of cameras and clock. Delays of images and of poses are none,
-constant, growing, jumping or only at the start, up to 5 s, half of them up to 0.6 s; every fifth flight has no poses
-but those of its images. A distance is too far if what is nearest in its 5 degrees is nearer by more than 0.3 m and what
-the body moves in 0.1 s, and too near if nothing within its 15 degrees, and 5 more and what the body turns in 0.1 s, is
-as near. Sectors that are sent as unknown say nothing. `--arrival`: ages count from arrival, as they did before.
+Each seed is another hall with pillars, path, number of cameras and clock. Delays of images and of poses are none,
+constant, growing, jumping or only at the start, up to 5 s, half of them up to 0.6 s; every fifth flight has only the
+poses of its images. A distance is too far if the nearest surface in its 5 degrees is nearer by more than 0.3 m plus the
+body's motion in 0.1 s, and too near if nothing within its 15 degrees, plus 5 and the body's turn in 0.1 s, is that
+near. Sectors sent as unknown are ignored. `--arrival`: ages count from arrival, as before.
 
 Rules were chosen on seeds 10000:10020; figures are of 0:1000.
 """
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def told(flights: list[LateFlight]) -> dict[str, object]:
-    """Return what all flights come to."""
+    """Return the summary of all flights."""
     why: Counter[str] = sum((flight.why for flight in flights), Counter())
     names = "messages", "bad_messages", "distances", "too_far", "too_near", "images"
     return {

@@ -3,15 +3,15 @@
 
     python benchmarks/live.py [--seconds 600] [--cameras 1] [--hz 30] [--poses udp|track] [--no-page] [--json]
 
-Images (a D435's, 848x480, without reasons) of a loop through the furnished room are rendered first. A player in a
-process of its own then plays them in real time: it tells of each image when it is due, and sends the poses of the body
-200 times a second as lines over UDP; with `--poses track` it sends what an IMU feels instead, and the camera is
-tracked by depth, IMU and the grey pictures of a pattern on all surfaces (`--contrast 0`: no pictures). Several cameras
-look round, 360 degrees shared out. The page is open: another process reads what the page draws. Another is the
-autopilot, which is sent OBSTACLE_DISTANCE ten times a second. 2-D map and distances all round are kept up to date (with
---record a recording as well). Latency is from the stamp, which is when the image is due, until the map and its outputs
-have it, and until the autopilot has a message of it (`obstacles`); share: CPU time of the mapping process alone. At the
-end the same images are mapped offline in the same order: `cells_that_differ`.
+Images (a D435's, 848x480, without reasons) of a loop through the furnished room are rendered first. A player in its own
+process then plays them in real time: it reports when each image is due, and sends the poses of the body 200 times a
+second as lines over UDP; with `--poses track` it sends IMU readings instead, and the camera is tracked by depth, IMU
+and the grey pictures of a pattern on all surfaces (`--contrast 0`: no pictures). Several cameras face all around, 360
+degrees shared out. The page is open: another process reads its drawings. Another is the autopilot, which gets
+OBSTACLE_DISTANCE ten times a second. 2-D map and distances all around are kept up to date (with --record a recording
+too). Latency is from the stamp, when the image is due, until it is in the map and its outputs, and until the autopilot
+has a message from it (`obstacles`); share: CPU time of the mapping process alone. At the end the same images are mapped
+offline in the same order: `cells_that_differ`.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu
 
 LOOP_S = 8.0
-"""Seconds of one way through the room; the loop goes back the same way."""
+"""Seconds of one pass through the room; the loop returns along the same path."""
 POSE_HZ, LEAD_S = 200, 1.0
-"""Poses and readings of the IMU a second, and how much earlier they begin."""
+"""Poses and IMU readings a second, and how much earlier they begin."""
 NOWHERE = np.full((4, 4), np.nan)
 
 
 class Way:
-    """The body's way, forth and back for ever, at rest where it turns round."""
+    """The body's path, back and forth forever, at rest where it turns around."""
 
     def __init__(self, scene: str):
         self.simulation = Simulation(scene)
@@ -71,9 +71,10 @@ class Way:
 
 
 class Film:
-    """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one way through the loop.
+    """Depth images in a file, (images, cameras, height, width) uint16 millimetres, one pass through the loop.
 
-    With a contrast above 0, pictures of the colour camera next to the first one in another, (images, 480, 640) uint8.
+    With a contrast above 0, pictures of the colour camera next to the first one in another file, (images, 480, 640)
+    uint8.
     """
 
     T_depth_eye = np.eye(4)
@@ -106,7 +107,7 @@ class Film:
             pictures.flush()
 
     def photo(self, k: int, camera: int) -> sv.Photo | None:
-        """Return the picture that is taken with image `k` of a camera."""
+        """Return the picture taken with image `k` of a camera."""
         if camera or not self.contrast:
             return None
         return sv.Photo(np.array(self._pictures("r")[k]), self.eye, self.T_depth_eye)
@@ -119,13 +120,13 @@ class Film:
         return np.memmap(self.file, np.uint16, "r", shape=self.shape)
 
     def number(self, k: int) -> int:
-        """Return which image is seen as number `k` of an endless flight."""
+        """Return the image shown as number `k` of an endless flight."""
         period = 2 * (self.count - 1)
         return min(k % period, period - k % period)
 
 
 class Played(Stream):
-    """A camera that the player plays."""
+    """A camera played by the player."""
 
     def __init__(self, name: str, number: int, film: Film, told: Connection, imu: bool):
         self.name, self.camera, self.notes, self.posed = name, film.camera, (), False
@@ -149,7 +150,7 @@ class Played(Stream):
                     self._imu.add_angular_rate(when, rate)
                     self._imu.add_specific_force(when, force)
             image = self._film.number(k)
-            depth = np.array(images[image, self._number])  # a copy, as of a camera's buffer
+            depth = np.array(images[image, self._number])  # a copy, as from a camera's buffer
             yield sv.Frame(
                 depth, self.camera, NOWHERE, stamp_ns, 0.001, name=f"{self.name} {k}", fault="no_pose",
                 photo=self._film.photo(image, self._number),
@@ -157,7 +158,7 @@ class Played(Stream):
 
 
 class Noted:
-    """Which images were offered, in which order, and what became of them."""
+    """Offered images, in order, and their outcome."""
 
     def __init__(self) -> None:
         self.offered: list[tuple[str, int, Transform, str | None, str]] = []
@@ -171,20 +172,20 @@ class Noted:
             self._mapped.append((monotonic(), (time_ns() - frame.stamp_ns) / 1e9))
 
     def heard_ms(self, came: list[tuple[float, float]]) -> list[float]:
-        """Return how old the images were that messages told of, from their stamps until the messages came.
+        """Return the ages of images behind messages, from their stamps until the messages arrived.
 
-        came: when each message came, and since when the image it tells of was being mapped, both by `monotonic`.
+        came: arrival of each message, and since when its image was being mapped, both by `monotonic`.
         """
         done, age = np.array(self._mapped).reshape(-1, 2).T
         at, since = np.array(came).reshape(-1, 2).T
-        image = np.searchsorted(done, since, "right")  # the first that was mapped after that began
-        in_flight = (image < len(done)) & (at < done[-1] + 0.05)  # not those that are repeated after the last image
+        image = np.searchsorted(done, since, "right")  # the first mapped after that
+        in_flight = (image < len(done)) & (at < done[-1] + 0.05)  # not repeats after the last image
         at, image = at[in_flight], image[in_flight]
         return (1e3 * (at - done[image] + age[image])).tolist()
 
 
 def play(tell: list[Connection], scene: str, hz: float, seconds: float, port: int, imu: bool, ready: Any) -> None:
-    """Play in real time, in a process of its own."""
+    """Play in real time, in a separate process."""
     way, out = Way(scene), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     count = round(seconds * hz)
     ready.wait()
@@ -225,7 +226,7 @@ def felt(way: Way, seconds: float) -> tuple[list[float], list[float]]:
 
 
 def look(port: int, received: Any) -> None:
-    """Count the bytes of what a page gets, in a process of its own, as a browser on another machine would."""
+    """Count the bytes that a page gets, in a separate process, like a browser on another machine."""
     import viser
     from websockets.sync.client import connect
 
@@ -239,7 +240,7 @@ def look(port: int, received: Any) -> None:
 
 
 def differing(one: sv.VoxelMap, other: sv.VoxelMap) -> int:
-    """Return how many cells of two maps differ, bit for bit, unknown ones included."""
+    """Return the number of cells that differ between two maps, bit for bit, including unknown ones."""
     found = []
     for voxel_map in (one, other):
         coords, cells = voxel_map.storage.blocks_within(*EVERYWHERE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure: how many loops are found, how many are wrong, and how far off the way is before and after.
+"""Loop closure: loops found, wrong loops, and trajectory error before and after.
 
     python benchmarks/loops.py offices --seeds 0:50 [--drift 0.02] [--visits 10] [--width 212]
     python benchmarks/loops.py ring --seeds 0:10 [--drift 0.01] [--width 212]
@@ -7,9 +7,9 @@
     python benchmarks/loops.py apartment --seeds 0:5 [--drift 0.01] [--width 424]
     python benchmarks/loops.py RECORDING          # the camera is tracked; its own poses are taken for the truth
 
-Simulated walks with poses that drift, each seed with a walk and a drift of its own; every second frame. A loop is wrong
-where it is off by more than 0.5 m. A place is seen again where the camera stood within 0.7 m and 40 degrees of it, 5 m
-of way before: what share of these has a loop. The seam: by how much the relative pose of two such frames is wrong.
+Simulated walks with drifting poses, each seed with its own walk and drift; every second frame. A loop is wrong if it is
+off by more than 0.5 m. A place is revisited if the camera was within 0.7 m and 40 degrees of it, 5 m of path earlier:
+which share of these has a loop? The seam: error of the relative pose of two such frames.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def walk(location: str, every: int, settings: dict[str, Any]) -> tuple[int, int, int, int, NDArray[np.float64]]:
-    """Close the loops of one walk and tell what came of it."""
+    """Close the loops of one walk and print the results."""
     simulation = Simulation(location)
     mapper = sv.Mapper(voxel_size=0.1, threads=2, **{"map.keep_frames": True})
     for i in range(0, len(simulation), every):
@@ -97,7 +97,7 @@ def walk(location: str, every: int, settings: dict[str, Any]) -> tuple[int, int,
 
 
 def closed(frames: Sequence[KeptFrame], config: sv.Config) -> tuple[LoopCloser, float]:
-    """Return what closes the loops of frames, and how long it took."""
+    """Return the loop closer of frames, and its time."""
     start, closer = perf_counter(), LoopCloser(config)
     for frame in frames:
         closer.add(frame)
@@ -106,13 +106,13 @@ def closed(frames: Sequence[KeptFrame], config: sv.Config) -> tuple[LoopCloser, 
 
 
 def error(loop: Loop, truth: Sequence[NDArray[np.float64]]) -> float:
-    """Return by how many metres a loop is wrong."""
+    """Return the error of a loop in metres."""
     exact = inverse(truth[loop.first]) @ truth[loop.second]
     return float(np.linalg.norm(difference(exact, loop.match.T_earlier_later)[3:]))
 
 
 def seen_before(k: int, truth: Sequence[NDArray[np.float64]], closer: LoopCloser) -> Iterable[int]:
-    """Yield the submaps, some way before submap k, that the camera took from where and as it took that."""
+    """Yield earlier submaps taken from the same place and direction as submap k."""
     for i in range(k):
         if closer.submaps[k].travelled - closer.submaps[i].travelled > AFTER_M:
             moved = difference(truth[i], truth[k])
@@ -123,7 +123,7 @@ def seen_before(k: int, truth: Sequence[NDArray[np.float64]], closer: LoopCloser
 def seam(
     exact: Sequence[NDArray[np.float64]], poses: Sequence[NDArray[np.float64]], closer: LoopCloser
 ) -> NDArray[np.float64]:
-    """Return by how many metres relative poses of frames are wrong that were taken at one place on two visits."""
+    """Return the errors in metres of relative poses of frames taken at one place on two visits."""
     where = np.array(exact)[:, :3, 3]
     way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(where, axis=0), axis=1))])
     found = []
@@ -145,7 +145,7 @@ def in_mm(seams: NDArray[np.float64]) -> str:
 
 
 def ate(stamps: NDArray[np.int64], poses: Sequence[Any], exact: Sequence[Any]) -> float:
-    """Return the root of the mean square of the distances, after the ways are laid onto each other."""
+    """Return the root of the mean square of the distances, after alignment of the trajectories."""
     score = score_trajectory(Poses(stamps, np.array(poses)), Poses(stamps, np.array(exact)))
     return float(np.sqrt(np.mean(np.square(score.position_errors_m))))
 

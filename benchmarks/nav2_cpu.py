@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node costs next to Nav2: its share of a core at 160x120 and 640x480, 15 and 30 Hz, with all that Nav2 takes.
+"""Cost of the node with Nav2: its share of a core at 160x120 and 640x480, 15 and 30 Hz, with all Nav2 topics.
 
     python benchmarks/nav2_cpu.py [--seconds 20] [--json]
 
 Images of a simulated Kinect, cells of 0.05 m to 5 m, a 2-D map twice a second, obstacles and free rays ten times a
 second: the parameters of `stereovox ros2 --write-nav2`. As benchmarks/ros2.py measures it: CPU time of the node's
-process, receiving, mapping and publishing included, over the time on the wall.
+process, receiving, mapping and publishing included, over wall time.
 
-Next to it: users of spatio_temporal_voxel_layer report "more than 100%" at 160x120 and 30 Hz with cells of 0.2 m (issue
+By comparison, users of spatio_temporal_voxel_layer report "more than 100%" at 160x120 and 30 Hz with 0.2 m cells (issue
 182), and "more than 160%" with a D435i and cells of 0.05 m in ROS 2 (issue 188): on their machines, not on this one.
 
 Target: less than half a core at 160x120 and 30 Hz.

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How old is what an autopilot hears: from a depth image's arrival to OBSTACLE_DISTANCE in another process?
+"""Latency from a depth image's arrival to OBSTACLE_DISTANCE in another process.
 
     python benchmarks/obstacle_latency.py [--seconds 20] [--hz 30] [--rate 30] [--voxel-size 0.1] [--json]
 
 Simulated 848x480 images, rendered before, go to a mapper at `--hz`; an `ObstacleSender` sends at `--rate` over UDP on
-loopback to a process that takes the time of each message's arrival. `time_usec` is when the last image arrived, by the
-same clock. So mapping, waiting, sectors and the wire are in the latency. `cpu`: of this process, without rendering, as
-a share of one core; other work on the machine disturbs it less than the latency.
+loopback to a process that records each message's arrival. `time_usec` is the arrival of the last image, by the same
+clock. So mapping, waiting, sectors and the wire are included. `cpu`: of this process, without rendering, as a share of
+one core; other work on the machine disturbs it less than the latency.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def measured(given: argparse.Namespace) -> dict[str, Any]:
-    """Return latencies and what was lost."""
+    """Return latencies and losses."""
     here, there = get_context("spawn").Pipe()
     peer = get_context("spawn").Process(target=listen, args=(there,), daemon=True)
     peer.start()
@@ -74,7 +74,7 @@ QUANTILES = {"median": 50, "p90": 90, "p99": 99, "max": 100}
 
 
 def to_and_fro(frames: list[sv.Frame], n: int) -> sv.Frame:
-    """Return frame n of a walk to and fro, with stamps that ascend."""
+    """Return frame n of a walk back and forth, with ascending stamps."""
     from dataclasses import replace
 
     last = len(frames) - 1
@@ -83,7 +83,7 @@ def to_and_fro(frames: list[sv.Frame], n: int) -> sv.Frame:
 
 
 def listen(pipe: Connection) -> None:
-    """Take messages until told to end; send back when each came and when its frame had."""
+    """Receive messages until stopped; send back the arrival of each and of its frame."""
     m, came = dialect(), []
     parser = m.MAVLink(None)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thin poles before a textured wall, by stereo: what becomes of their pixels.
+"""Thin poles in front of a textured wall, by stereo: the fate of their pixels.
 
     python benchmarks/poles.py [METHODS] [--widths 1,2,4] [--seeds 8] [--first-seed 300] [--set stereo.halve=true ...]
 
 Pairs of 480x200 are rendered in eighths of a pixel, with grain of all sizes on the wall, and poles of 1, 2 and 4 px
-that are brighter and darker by turns. A pole's pixel that gets the wall's disparity is the dangerous error: it clears
-the pole. Settings were chosen on seeds 100 to 102.
+that are alternately brighter and darker. A pole's pixel that gets the wall's disparity is the dangerous error: it
+clears the pole. Settings were chosen on seeds 100 to 102.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from stereovox.frame import Reason, StereoFrame
 
 HEIGHT, WIDTH, FINE = 200, 480, 8
 MARGIN = 32
-"""Columns of wall next to the image, for the other eye."""
+"""Columns of wall beyond the image, for the other eye."""
 WIDTHS = 1.0, 2.0, 4.0
 NOISE = 2.0
 GRAIN = (32, 1.0), (16, 1.0), (8, 1.0), (4, 1.0), (2, 1.0), (1, 0.5)
@@ -67,7 +67,7 @@ def grain(random: np.random.Generator, width: int, spread: float) -> NDArray[np.
 def rendered(
     random: np.random.Generator, case: Case, widths: Sequence[float] = WIDTHS
 ) -> tuple[list[NDArray[np.uint8]], list[tuple[slice, float]]]:
-    """Return the left and right image, and of each pole its columns in the left one and its width."""
+    """Return the left and right image, and for each pole its columns in the left one and its width."""
     wall = 120 + grain(random, WIDTH + 2 * MARGIN, case.wall_grain)
     start, stop, off = MARGIN * FINE, (MARGIN + WIDTH) * FINE, round(case.wall * FINE)
     sides, poles = [wall[:, start:stop].copy(), wall[:, start + off : stop + off].copy()], []
@@ -87,7 +87,7 @@ def rendered(
 
 
 def shares(depth: StereoDepth, case: Case, seed: int, widths: Sequence[float] = WIDTHS) -> dict[float, list[float]]:
-    """Return for each width which shares of the poles' pixels get the wall's disparity, their own, and none."""
+    """Return, for each width, the shares of the poles' pixels with the wall's disparity, their own, and none."""
     (left, right), poles = rendered(np.random.default_rng([seed, 4242]), case, widths)
     found = depth.disparity(StereoFrame(left, right, StereoPair(CAMERA), np.eye(4)))
     far = found.reason == Reason.TOO_FAR

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries a second, one thread, next to octomap-python on the same cells where it is installed.
+"""Queries a second, one thread, against octomap-python on the same cells if it is installed.
 
     python benchmarks/queries.py RECORDING [FRAMES] [--voxel-size 0.05] [--json]     for example recordings/kitchen ::4
 
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def rate(n: int, query: Callable[..., object], *asked: object) -> float:
-    """Return how many of `n` queries are answered in a second; the first run, which may compile, does not count."""
+    """Return the rate of `n` queries per second; the first run, which may compile, does not count."""
     query(*asked)
     times = []
     for _ in range(RUNS):
@@ -116,7 +116,7 @@ def walks(m: sv.VoxelMap, n: int) -> np.ndarray:
 
 
 def rays(m: sv.VoxelMap, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the camera stood last, and directions (n, 3) all round and within 53 degrees of its view."""
+    """Return the last camera position, and directions (n, 3) all around and within 53 degrees of its view."""
     rng = np.random.default_rng(2)
     T = m.viewpoint.T_world_camera
     ahead = np.column_stack([rng.uniform(-0.5, 0.5, (n, 2)), np.ones(n)]) @ T[:3, :3].T

@@ -3,8 +3,8 @@
 
     python benchmarks/rolling.py [METRES]
 
-Flies METRES (2,000) of a simulated boulevard out and back three times: with cells that leave dropped, kept in tiles,
-and with an unbounded map, whose cells the tiles must equal.
+Flies METRES (2,000) of a simulated boulevard out and back three times: with cells outside dropped, kept in tiles, and
+with an unbounded map, whose cells the tiles must equal.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from stereovox.maps.cells.evidence import Evidence
 
 CHIEN = {"voxel_size": 0.2, "window.size": [20.0, 6.0, 20.0]}
 FLIGHT = {"voxel_size": 0.2, "max_range": 5.0, "window.size": [20.0, 20.0, 16.0]}
-"""The window holds all that the camera sees up to 5 m, so that nothing is cut off and maps can be compared."""
+"""The window contains the whole view up to 5 m, so that nothing is cut off and maps are comparable."""
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def shift_ms(outside: str) -> float:
-    """Return the median time of moving a full window by one cell, evidence put back in between."""
+    """Return the median time of moving a full window by one cell, with evidence restored in between."""
     rolling = make_map(load_config(**CHIEN, **{"window.outside": outside}))
     blocks = np.stack(np.meshgrid(*map(np.arange, (-8, -3, -8), (60, 4, 8)), indexing="ij"), -1).reshape(-1, 3)
     full = Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), blocks.astype(np.int32), -100)

@@ -5,9 +5,9 @@
 
 Two processes on loopback: this one sends simulated 848x480 images (16UC1), camera_info and, at 100 Hz, /tf, stamped
 with the clock on the wall, and listens to the 2-D map; the other is the node. Latency: from an image's stamp to the
-arrival of a map with that stamp here, so sending, waiting for the pose, mapping, publishing and receiving are in it.
+arrival of a map with that stamp here, including sending, waiting for the pose, mapping, publishing and receiving.
 `cpu`: CPU time of the node's process, as a share of one core and in milliseconds a frame; other work on the machine
-disturbs it less than the latency. --listen cells: take the cloud and the OctoMap as well, once a second; nav2: the
+disturbs it less than the latency. --listen cells: also receive the cloud and the OctoMap, once a second; nav2: the
 obstacles and the free rays, ten times a second.
 """
 
@@ -44,12 +44,12 @@ SOURCE = "sim:room"
 PROFILE = Path(__file__).resolve().parents[1] / "examples/ros2/large_images.xml"
 """For both processes; FASTDDS_DEFAULT_PROFILES_FILE="" measures without it."""
 WARM_S = 3.0
-"""Seconds at the start that do not count: processes find each other."""
+"""Seconds at the start that do not count, while processes find each other."""
 PERCENTILES = (50, 90, 99, 100)
 
 
 def images(where: str) -> tuple[list[tuple[Image, np.ndarray]], CameraInfo]:
-    """Messages of a piece of the flight, forth and back, T_world_camera of each, and their camera."""
+    """Messages of a piece of the flight, back and forth, T_world_camera of each, and their camera."""
     source = sv.open_source(where)
     found = []
     for i in range(FRAMES):
@@ -69,7 +69,7 @@ def transform(T: np.ndarray, stamp_ns: int) -> bytes:
 
 
 class Sender:
-    """Sends images and transforms at their times, each with the pose that belongs to it."""
+    """Sends images and transforms at their times, each with its own pose."""
 
     def __init__(self, node: Any, hz: float, where: str = SOURCE):
         self._frames, self._info = images(where)
@@ -81,7 +81,7 @@ class Sender:
         self._k = 0
 
     def run(self, seconds: float) -> None:
-        """Send for so long. A transform between two images holds the pose of the last one."""
+        """Send for `seconds`. A transform between two images has the pose of the last one."""
         begin, k, t = time.monotonic(), 0, 0
         while time.monotonic() < begin + seconds:
             due = begin + min(k / self._hz, t / TF_HZ)
@@ -101,7 +101,7 @@ class Sender:
 
 
 class Listener:
-    """Notes when a map of which stamp came."""
+    """Records stamps and arrival times of maps."""
 
     def __init__(self, node: Any, listen: str):
         self.came: dict[int, int] = {}
@@ -132,7 +132,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         while not node.count_subscribers("/camera/image"):
             time.sleep(0.05)
-        time.sleep(1.0)  # both sides know of each other now
+        time.sleep(1.0)  # both sides have found each other
         other = psutil.Process(process.pid)
         sender.run(WARM_S)
         warm, cpu, began = len(sender.sent), sum(other.cpu_times()[:2]), time.monotonic()

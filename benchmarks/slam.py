@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def timed(config, scans) -> tuple[list, list[float], SlamResult, float]:
-    """Poses as told on the way, processor seconds of each scan, the result, processor seconds of the end."""
+    """Online poses, processor seconds of each scan, the result, processor seconds of the end."""
     import gtsam  # noqa: F401 - once in a process, half a second
 
     map_scans(scans[:3], config)  # compiles

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM on simulated drives that go wrong: slipping wheels, people, glass, corridors all alike. Is a wrong map doubted?
+"""SLAM on simulated drives that go wrong: slipping wheels, people, glass, identical corridors. Is a wrong map doubted?
 
 python benchmarks/slam_drives.py 0:50 [--verbose] [setting=value ...]
 
@@ -23,7 +23,7 @@ from stereovox.simulate.floors.view import cast
 
 WRONG_M = 0.5
 EVERY = 10
-"""Poses of the drive for one scan: 0.2 s."""
+"""Poses of the drive per scan: 0.2 s."""
 SPEED = 0.5
 
 
@@ -61,7 +61,7 @@ def worst_m(found: se2.Pose, truth: se2.Pose) -> float:
 
 
 def slipping_drive(seed: int) -> tuple[list[Scan], se2.Pose, str]:
-    """Return the scans of a drive, the true poses (N, 3) at them, and what goes wrong in words."""
+    """Return the scans of a drive, the true poses (N, 3) at them, and the faults in words."""
     random = np.random.default_rng([seed, 2718])
     free, stops, plan = corridors(random)
     poses = drive([Stop(*stop) for stop in stops], SPEED)
@@ -88,7 +88,7 @@ def slipping_drive(seed: int) -> tuple[list[Scan], se2.Pose, str]:
 
 
 def corridors(random: np.random.Generator) -> tuple[list, list[tuple[float, float]], str]:
-    """Return free rectangles, stops and a name: a ring, a dead end or a branching corridor, with doors all alike."""
+    """Return free rectangles, stops and a name: a ring, a dead end or a branching corridor, with identical doors."""
     width, length, depth = random.uniform(1.6, 2.6), random.uniform(14, 28), random.uniform(8, 16)
     plan = str(random.choice(["ring", "dead end", "branch"]))
     half = width / 2
@@ -109,7 +109,7 @@ def corridors(random: np.random.Generator) -> tuple[list, list[tuple[float, floa
     else:
         stops += [(0.5, 0.0)] if random.random() < 0.7 else []
     pitch = random.uniform(2.5, 4.0)
-    for x in np.arange(1.5, length - 2.5, pitch):  # doors all alike, some of them rooms that stand open
+    for x in np.arange(1.5, length - 2.5, pitch):  # identical doors, some of them open rooms
         free.append((x, -half - 0.12, x + 0.9, -half + 0.1))
         if random.random() < 0.25:
             free += [(x, -half - 0.3, x + 0.9, -half), (x - 0.8, -half - random.uniform(2, 3), x + 1.4, -half - 0.25)]
@@ -117,7 +117,7 @@ def corridors(random: np.random.Generator) -> tuple[list, list[tuple[float, floa
 
 
 def slipped(poses: se2.Pose, random: np.random.Generator) -> tuple[se2.Pose, str]:
-    """Return what the wheels believe (N, 3): drift, and up to four slips of 0.6 to 3 s."""
+    """Return the wheels' poses (N, 3): drift, and up to four slips of 0.6 to 3 s."""
     step = se2.relative(poses[:-1], poses[1:])
     words = []
     for _ in range(int(random.integers(0, 5))):
@@ -152,14 +152,14 @@ def panes(walls: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, n
 
 
 def walker(stops: list, count: int, random: np.random.Generator) -> se2.Pose:
-    """Return where a person is at each step (count, 2): to and fro along the stops, next to the robot's line."""
+    """Return a person's position at each step (count, 2): back and forth along the stops, next to the robot's line."""
     path = drive([Stop(*stop) for stop in stops], random.uniform(0.6, 1.3))[:, :2]
     path = np.vstack([path, path[::-1]]) + random.uniform(-0.5, 0.5, 2)
     return path[(int(random.integers(len(path))) + np.arange(count)) % len(path)]
 
 
 def _apart(person: np.ndarray, pose: se2.Pose) -> float:
-    """Metres between a person and the robot: they do not walk through it, but step aside out of sight."""
+    """Metres between a person and the robot: they do not walk through it, but step aside."""
     return float(np.hypot(*(person - pose[:2])))
 
 

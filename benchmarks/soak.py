@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An hour of flight: does the memory stay as it is, and does every frame come in time?
+"""An hour of flight: is memory constant, and is every frame in time?
 
     python benchmarks/soak.py [--frames 108000] [--stereo] [--deadline-ms 33] [--json] [--picture soak.png]
 
-A loop of simulated frames is rendered once and flown forth and back as fast as frames are taken, with stamps that rise
-by 1/30 s and a start that drifts through space, so that the window of the map keeps moving. `wall`: milliseconds of
-`Mapper.add` by the clock on the wall, `cpu`: the same in CPU time of all threads, which other processes disturb less.
-The first minute, in which kernels are compiled and memory is taken, is the measure for the rest.
+A loop of simulated frames is rendered once and flown back and forth as fast as frames are accepted, with stamps that
+rise by 1/30 s and a start that drifts through space, so that the map's window keeps moving. `wall`: milliseconds of
+`Mapper.add` by wall clock, `cpu`: the same in CPU time of all threads, which other processes disturb less. The first
+minute, in which kernels are compiled and memory is allocated, is the reference for the rest.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Loop:
                 self._file.write(image.tobytes())
 
     def frame(self, i: int) -> AnyFrame:
-        """Return the frame that is flown as number `i`."""
+        """Return frame number `i` of the flight."""
         there, back = i % (2 * self._count), 2 * self._count - 1 - i % (2 * self._count)
         k, stamp_ns, name = min(there, back), i * 1_000_000_000 // HZ, f"frame {i}"
         T = self._source.pose(k).copy()
@@ -111,9 +111,9 @@ def setting(text: str) -> tuple[str, object]:
 
 
 def fly(mapper: sv.Mapper, loop: Loop, count: int) -> dict:
-    """Add `count` frames; return the figures of every minute and of the whole, and print them on the way."""
+    """Add `count` frames; return the figures of every minute and of the whole, printing them on the way."""
     process = psutil.Process()
-    wall, cpu = np.full(count, np.nan), np.full(count, np.nan)  # taken and touched now, not while memory is watched
+    wall, cpu = np.full(count, np.nan), np.full(count, np.nan)  # allocated and touched now, not while memory is watched
     refused, ways, minutes = Counter(), Counter(), []
     say(" minute  RSS MB   map MB   wall ms: p50    p99    max   cpu ms: p50    p99    max   refused  load")
     for i in range(count):

@@ -3,7 +3,7 @@
 
 python benchmarks/stereo2015.py FOLDER [setting=value ...]      for example: ~/kitti_stereo2015 method=block
 
-FOLDER is that which holds `training`, or `training` itself.
+FOLDER contains `training`, or is `training` itself.
 """
 
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much do stereo settings lose on scenes they were not chosen on?
+"""Loss of stereo settings on scenes they were not chosen on.
 
     python benchmarks/stereo_splits.py FOLDER [--pairs FOLDER:SCALE ...] [--density 85] [--grid p1=8,16,24 ...]
                                        [--choose 0,2,4,6] [--set method=sgm ...]
@@ -37,14 +37,14 @@ from stereovox.frame import StereoFrame
 LEVELS = 1000
 """Steps of confidence."""
 LIMITS = 1.0, 2.0, 3.0
-"""Errors in pixels from which on a disparity is wrong; the last one chooses."""
+"""Errors in pixels above which a disparity is wrong; the last one decides the choice."""
 DEFAULT = 1 + int(LEVELS * load_config().stereo.min_confidence)
 """The level of the default confidence."""
 GRID = "p1=8,16,24", "p2=40,64,96", "uniqueness=5,15,25", "block_size=3,5,7", "speckle_size=100,400,800"
 NAMES = ("im2", "im6", "disp2"), ("view1", "view5", "disp1")
 Tally = NDArray[np.int64]
-"""(1 + len(LIMITS), LEVELS + 1): pixels of the truth with a disparity, and wrong ones, of at least this confidence; of
-column 0 the first is all pixels of the truth."""
+"""(1 + len(LIMITS), LEVELS + 1): number of the truth's pixels with a disparity of at least this confidence, and of
+wrong ones; the first of column 0 is all pixels of the truth."""
 Pair = tuple[StereoFrame, NDArray[np.float64]]
 """Two images, and the true disparity of the left one (NaN: unknown)."""
 
@@ -58,11 +58,11 @@ class Outcome:
 
 
 Rows = dict[str, list[Outcome]]
-"""By name one outcome of each split."""
+"""One outcome per split, by name."""
 
 
 def tally(found: Disparity, truth: NDArray[np.float64]) -> Tally:
-    """Return how many pixels are there and wrong from each level of confidence on."""
+    """Return the number of pixels present and wrong at each level of confidence or above."""
     has = np.isfinite(truth)
     kept = has & np.isfinite(found.disparity)
     level = np.minimum((LEVELS * found.confidence[kept]).astype(int), LEVELS - 1) + 1
@@ -75,13 +75,13 @@ def tally(found: Disparity, truth: NDArray[np.float64]) -> Tally:
 
 
 def level_of(counts: Tally, density: float) -> int:
-    """Return the highest level that leaves `density` per cent of the truth's pixels; 1, all, where none does."""
+    """Return the highest level that leaves `density` per cent of the truth's pixels; 1, all, if none does."""
     enough = np.flatnonzero(100 * counts[0, 1:] >= density * counts[0, 0])
     return int(enough[-1]) + 1 if len(enough) else 1
 
 
 def outcome(counts: Tally, level: int) -> Outcome:
-    """Return what the pixels of at least this level are worth."""
+    """Return the outcome of the pixels at this level or above."""
     kept = counts[0, level]
     return Outcome(100 * kept / counts[0, 0], 100 * counts[1:, level] / max(kept, 1))
 
@@ -106,7 +106,7 @@ def middlebury(folder: Path, scale: float) -> Iterator[Pair]:
 
 
 def seen_by_both(truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a dense truth without what the right image does not show: beyond it, or behind something nearer."""
+    """Return a dense truth without pixels hidden from the right image: outside it, or behind a nearer surface."""
     out = truth.copy()
     for row, kept in zip(truth, out, strict=True):
         columns = np.flatnonzero(np.isfinite(row))
@@ -134,7 +134,7 @@ def line(name: str, rows: list[Outcome]) -> str:
 
 
 def settings_of(grid: list[str]) -> list[dict[str, Any]]:
-    """Return all settings of a grid like ["p1=8,16", "p2=40,64"]; before them none: the defaults."""
+    """Return all settings of a grid like ["p1=8,16", "p2=40,64"]; preceded by the defaults."""
     axes = [(name, values.split(",")) for name, _, values in (axis.partition("=") for axis in grid)]
     rows = product(*([(f"stereo.{name}", parse_value(value)) for value in values] for name, values in axes))
     return [{}, *(dict(row) for row in rows)]
@@ -170,7 +170,7 @@ def main() -> None:
 
 
 def compared(counts: NDArray[np.int64], density: float, chosen: list[int]) -> tuple[Rows, list[tuple[int, int]]]:
-    """Return what choosing is worth, and which settings and level of confidence each split chose.
+    """Return the outcomes of choosing, and the settings and level of confidence that each split chose.
 
     counts: (settings, scenes) of `Tally`, the defaults first.
     """
@@ -196,7 +196,7 @@ def compared(counts: NDArray[np.int64], density: float, chosen: list[int]) -> tu
 
 
 def elsewhere(made: list[dict[str, Any]], picked: list[tuple[int, int]], pairs: list[Pair], name: str) -> Rows:
-    """Return what the splits' choices and the defaults are worth on `pairs`, that are called `name`."""
+    """Return the outcomes of the splits' choices and of the defaults on `pairs`, labelled `name`."""
     counts = {k: tallies({**made[k], "stereo.disparities": 80}, pairs).sum(0) for k in {0, *(k for k, _ in picked)}}
     return {
         f"chosen, on {name}": [outcome(counts[best], level) for best, level in picked],

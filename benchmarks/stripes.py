@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A board of equal stripes before a textured wall, by stereo: how much of it gets a wrong disparity, and how surely.
+"""A board of equal stripes in front of a textured wall, by stereo: share of wrong disparities, and their confidence.
 
     python benchmarks/stripes.py [--periods 5,8,12,20,33] [--grain 0,4] [--seeds 2] [--set stereo.uniqueness=30 ...]
 
 Every stripe looks like the next but one, so only the board's edges, and its grain (a standard deviation in grey values;
-0: none at all), tell which is which. Pairs of 480x200, boards of 240x120, disparities 24.3 and 15.6 px, stripes 12 and
+0: none), distinguish them. Pairs of 480x200, boards of 240x120, disparities 24.3 and 15.6 px, stripes 12 and
 40 grey values brighter or darker than the board, image noise of 2.
 """
 
@@ -25,7 +25,7 @@ from stereovox.frame import StereoFrame
 MARGIN = 64
 ROWS, COLUMNS = slice(40, 160), (120, 360)
 INNER = slice(50, 150), slice(130, 350)
-"""What is judged: the board without its edges."""
+"""The judged part: the board without its edges."""
 DISPARITIES = (24.3, 5.0), (15.6, 4.0)
 CONTRASTS = 12, 40
 WRONG_PX = 3.0

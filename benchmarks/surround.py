@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How true the stitched sphere of a simulated drone with four stereo cameras is, direction by direction.
+"""Accuracy of the stitched sphere of a simulated drone with four stereo cameras, direction by direction.
 
 python benchmarks/surround.py [MOMENTS] [SCALE] [STEP_DEG] [KEY=VALUE ...]      for example: 6 2 1 sphere.spread=2
 """
@@ -47,7 +47,7 @@ def main(moments: str = "6", scale: str = "1", step_deg: str = "1", *overrides: 
 
 
 class Look:
-    """One pair's frame: its depth as found, the true one, and what it took."""
+    """One pair's frame: its estimated depth, the true one, and its time."""
 
     def __init__(self, drone: Surround, i: int, kind: str, config: Config):
         self.i, self.pair = i, drone.pairs[i % len(drone.pairs)]
@@ -65,7 +65,7 @@ class Look:
         return accumulate(prepare(self.frame, config), T_body_eye, config)
 
     def disparity_error(self) -> tuple[np.ndarray, float]:
-        """Errors in pixels where both know a depth, and the share of true pixels that do."""
+        """Errors in pixels where both have a depth, and the share of true pixels that do."""
         there = self.truth.reason == Reason.VALID
         found = there & np.isfinite(self.frame.depth) & (self.frame.depth > 0)
         found &= (self.frame.reason == Reason.VALID) if self.frame.reason is not None else True
@@ -84,7 +84,7 @@ def disparity_of(pair, depth_m):
 
 
 def report_matching(looks) -> float:
-    """Print how good the matching is; return the standard deviation of good disparities in pixels."""
+    """Print the quality of the matching; return the standard deviation of good disparities in pixels."""
     good = []
     for k, pair in enumerate(four.pair for four in looks[0]):
         errors, density = zip(*(four[k].disparity_error() for four in looks), strict=True)

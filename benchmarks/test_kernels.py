@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a frame one by one, on a simulated image: `pytest benchmarks/test_kernels.py`.
+"""The stages of a frame one by one, on a simulated image: `pytest benchmarks/test_kernels.py`.
 
 Needs pytest-benchmark (`pip install 'stereovox[bench]'`). Compare two versions with `--benchmark-save` and
-`--benchmark-compare`. Cells and range as in the default profile where the name of a test says nothing else.
+`--benchmark-compare`. Cells and range are the default profile's unless a test's name says otherwise.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ POINTS = 100_000
 
 @pytest.fixture(scope="module")
 def frame():
-    """One of the room's, in the middle of it."""
+    """A frame from the middle of the room."""
     return open_source("sim:room").frame(60)
 
 
@@ -34,7 +34,7 @@ def image_of(frame, config):
 
 
 def held(evidence):
-    """Evidence that outlives the next call of its integrator, whose memory it is."""
+    """A copy of evidence that outlives the next call of its integrator."""
     return replace(evidence, **{name: getattr(evidence, name).copy() for name in ("coords", "values", "uniform")})
 
 
@@ -64,13 +64,13 @@ def test_evidence(benchmark, frame, integrator, voxel_size):
 
 
 def test_window_images(benchmark, frame):
-    """Cells so large that hardly anything but the window images is left to do."""
+    """Cells so large that little but the window images is left to do."""
     config = settings(2.0)
     benchmark(make_integrator(config).evidence, image_of(frame, config))
 
 
 def test_culling(benchmark, frame):
-    """Nothing but free space up to the range: most boxes are found free at once, only the borders are looked at."""
+    """Nothing but free space up to the range: most boxes are found free at once, only the borders are inspected."""
     config = settings(0.02)
     image = image_of(frame, config)
     empty = replace(
@@ -80,7 +80,7 @@ def test_culling(benchmark, frame):
 
 
 def test_scattering_hits(benchmark, frame):
-    """All pixels right before the camera: their cells are found, and there is hardly any space to clear."""
+    """All pixels right in front of the camera: their cells are found, and there is little space to clear."""
     config = settings(0.02)
     image = image_of(frame, config)
     near = replace(image, depth_m=np.full_like(image.depth_m, 0.3), reason=np.zeros_like(image.reason))
@@ -95,14 +95,14 @@ def test_evaluation(benchmark, frame):
 
 @pytest.mark.parametrize("voxel_size", SIZES)
 def test_adding_to_the_map(benchmark, frame, voxel_size):
-    """The same evidence again and again, so its free blocks end at the lower limit, as in a map that is flown over."""
+    """The same evidence repeatedly, so that its free blocks reach the lower limit, as in a revisited map."""
     voxel_map, evidence = holds(frame, settings(voxel_size))
     benchmark(voxel_map.add, evidence)
 
 
 @pytest.mark.parametrize("voxel_size", SIZES)
 def test_adding_to_a_new_map(benchmark, frame, voxel_size):
-    """Every block has to be made."""
+    """Every block has to be created."""
     config = settings(voxel_size)
     _, evidence = holds(frame, config)
     benchmark.pedantic(

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of poles and wires of 0.3 to 4 pixels: stereovox and OctoMap on the same frames.
+"""Poles and wires of 0.3 to 4 pixels in maps: stereovox and OctoMap on the same frames.
 
     python benchmarks/thin.py [--sweep | --random N [--apart] | --gaps | --poses] [--seeds 3] [--first-seed 0]
                               [--only WORDS] [--alone] [--set key=value ...] [--json] [--camera d435]
                               [--picture thin.png]
 
-A pole stands before a wall, or before nothing, and a simulated camera looks at it while it stands, flies or turns.
-`lost`: share of the layers of cells along the pole, as far as it was seen, without one occupied cell that the pole
-touches. `free`: share of the cells that the pole touches and the map calls free. Truth is exact, a cylinder.
-The cases' own noise is independent from pixel to pixel; `--camera d435` takes all of them with a camera that errs as a
-real one does (`stereovox.simulate.honest`).
+A pole is in front of a wall, or of nothing, and a simulated camera sees it while it rests, flies or turns. `lost`:
+share of the layers of cells along the observed pole without an occupied cell that the pole touches. `free`: share of
+the cells that the pole touches and the map calls free. Truth is exact, a cylinder.
+The cases' own noise is independent from pixel to pixel; `--camera d435` uses a realistic camera
+in all of them (`stereovox.simulate.honest`).
 
 `--random N` takes N random scenes, one for each seed from `--first-seed` on; with `--apart` half of them with
-the camera or the noise that no setting was chosen on. `--gaps` and `--poses` vary the gap behind the pole and the noise
-of poses.
-All end with the excess of stereovox over OctoMap: the largest, that of the worst twentieth, and the mean.
+the camera or the noise on which no setting was chosen. `--gaps` and `--poses` vary the gap behind the pole and the
+noise of poses. All end with the excess of stereovox over OctoMap: the largest, that of the worst twentieth, and the
+mean.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ from stereovox.frame import Reason
 
 
 def touched(scene: Scene, seed: int, voxel_size: float, low: float, high: float) -> tuple[NDArray, NDArray]:
-    """Return a point (N, 3) in each cell the pole touches between two places along its axis, and the cells' layers.
+    """Return a point (N, 3) in each cell that the pole touches between two places along its axis, and the cells'
+    layers.
 
-    low, high: metres along the axis of the world that the pole follows most, in which layers are counted.
+    low, high: metres along the world axis nearest to the pole's, along which layers are counted.
     """
     start = start_of(seed)[:3, 3]
     a, radius = scene.axis, scene.pole / 2
@@ -69,7 +70,7 @@ def touched(scene: Scene, seed: int, voxel_size: float, low: float, high: float)
 
 @dataclass
 class Found:
-    """lost, free: shares as above, between 0 and 1. wall: mean occupied cells of columns through the wall."""
+    """lost, free: shares as above, between 0 and 1. wall: mean number of occupied cells in columns through the wall."""
 
     lost: float
     free: float
@@ -114,7 +115,7 @@ def with_octomap(scene: Scene, frames: list[Frame], seed: int, voxel_size: float
     for frame in frames:
         z, reach, place = np.asarray(frame.depth, float), max(5.0, 1.5 * scene.distance), frame.T_world_sensor[:3, 3]
         z = np.where((frame.reason == Reason.TOO_FAR) | (z > reach), 2 * reach, z)
-        if scene.along:  # what passes no cell of the pole changes nothing there, and takes hours
+        if scene.along:  # rays away from the pole's cells change nothing there, and take hours
             T = np.linalg.inv(start_of(seed)) @ frame.T_world_sensor
             z[~near_pole(scene, frame, T, voxel_size)] = 0
             reach = min(reach, float(np.linalg.norm(T[:3, 3])) + scene.along + scene.pole + 3 * voxel_size)
@@ -129,7 +130,7 @@ def with_octomap(scene: Scene, frames: list[Frame], seed: int, voxel_size: float
 
 
 def near_pole(scene: Scene, frame: Frame, T: NDArray, voxel_size: float) -> NDArray[np.bool_]:
-    """Return which pixels (height, width) look at cells of the judged part of the pole from this pose."""
+    """Return which pixels (height, width) see cells of the judged part of the pole from this pose."""
     camera = frame.camera
     spots = pixels_of(scene, camera, T)
     nearest = (0.7 if scene.motion == "towards" else 0.9) * scene.distance - scene.along * abs(scene.axis[0])
@@ -196,7 +197,7 @@ def compared(
 
 
 def sweep() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
-    """Return poles of 0.3 to 4 pixels under all noises, motions and backgrounds, by both integrators."""
+    """Return poles of 0.3 to 4 pixels with all noises, motions and backgrounds, by both integrators."""
     scenes = {
         f"{pixels} px, {noise}, {motion}, {background}": (
             px(pixels, width=424, noise=noise, motion=motion, gap=gap), 0.1, {},
@@ -211,7 +212,7 @@ def sweep() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
 
 
 def gaps() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
-    """Return a pole of 0.9 pixels at half a sigma to ten before its wall, upright, level and leaning."""
+    """Return a pole of 0.9 pixels at half a sigma to ten in front of its wall, upright, level and leaning."""
     scenes = {}
     for sigmas in (0.5, 1, 1.5, 2, 2.3, 2.6, 3, 4, 6, 10):
         for tilt_deg in (0.0, 30.0, 90.0):
@@ -223,7 +224,7 @@ def gaps() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
 
 
 def poses() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
-    """Return a pole of 13 mm with poses that are off by up to 20 mm and 0.6 degrees."""
+    """Return a pole of 13 mm with pose errors of up to 20 mm and 0.6 degrees."""
     return {
         f"poses off by {mm} mm, {degrees} deg, {voxel_size} m": (
             Scene(0.013, 2.0, 0.8, 424, "d435", pose_noise=(mm / 1000, degrees), frames=40), voxel_size, {},
@@ -248,7 +249,7 @@ def excesses(rows: dict[str, dict[str, dict[str, float]]]) -> Iterator[str]:
 
 
 def draw(rows: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
-    """Draw lost and free shares of both libraries, a line a case."""
+    """Draw lost and free shares of both libraries, one line per case."""
     from stereovox.view.figures import blank, labels, png_of
 
     figure = blank(9, 1.5 + 0.28 * len(rows))
@@ -269,7 +270,7 @@ def draw(rows: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
 
 
 def chosen(wanted: argparse.Namespace) -> Iterator[tuple[str, Scene, float, dict[str, Any], range]]:
-    """Yield name, scene, side of cells, settings and seeds of all cases that are asked for."""
+    """Yield name, scene, side of cells, settings and seeds of all requested cases."""
     if wanted.random:
         for seed in range(wanted.first_seed, wanted.first_seed + wanted.random):
             name, scene, voxel_size = random_scene(seed, wanted.apart)

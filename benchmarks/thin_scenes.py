@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes with a thin pole, as `thin.py` maps them: what stands where, how a camera moves, and what it measures."""
+"""Scenes with a thin pole, as `thin.py` maps them: the geometry, the camera's motion, and its measurements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereovox.simulate.honest import RealisticDepthCamera
 
 HZ = 30
 HFOV_DEG, BASELINE, SUBPIXEL = 91.2, 0.05, 0.08
-"""Of a RealSense D435."""
+"""Parameters of a RealSense D435."""
 ASPECT = 480 / 848
 ROWS = 128
 """Rows of its image that are used."""
@@ -28,21 +28,21 @@ MOTIONS = ("still", "sideways", "up", "towards", "turning", "shaking")
 BACKGROUNDS = {"close": 0.2, "wall": 0.8, "open": np.inf}
 """Metres from the pole's axis to the wall behind it."""
 ALONG_PX, ALONG_CELLS = 40, 4
-"""Half the length of pole that is judged in a random scene: at least so many pixels, and so many cells."""
+"""Half the judged length of the pole in a random scene, at least: in pixels, and in cells."""
 ROOM_PX = 24
-"""Pixels of a random scene's image on all sides of that part."""
+"""Margin in pixels around that part in a random scene's image."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A pole, what is behind it, a camera and how it moves.
+    """A pole, its background, a camera and its motion.
 
-    pole: its thickness in metres; distance: from the camera's mean place to its axis. tilt_deg: of the pole, in the
+    pole: its thickness in metres; distance: from the camera's mean position to its axis. tilt_deg: of the pole, in the
     image (90: level); lean_deg: towards the wall. gap: metres from the axis to the wall behind, inf for none;
     slant_deg: of the wall. width: pixels across the whole image; focal: its focal length in pixels, 0: from `hfov_deg`.
     noise, motion: one of NOISES and MOTIONS; swing: metres that the camera moves to each side. pose_noise: standard
     deviation of the poses given to the map, in metres along each axis and degrees about each. nearest: least depth that
-    the camera delivers, in metres; nearer pixels have no value, and the camera does not say why. box: first column and
+    the camera delivers, in metres; nearer pixels have no value, without a reason. box: first column and
     row, columns and rows of the part of the image that is used. along: half the length of pole that is judged, in
     metres; 0: nearly all that is seen.
     """
@@ -100,7 +100,7 @@ class Scene:
 
 
 def px(pixels: float, distance: float = 4.0, width: int = 320, **other: object) -> Scene:
-    """Return a scene with a pole of so many pixels."""
+    """Return a scene with a pole `pixels` wide."""
     scene = Scene(0.01, distance=distance, width=width, **other)  # pyright: ignore[reportArgumentType]
     return replace(scene, pole=pixels * distance / scene.camera.fx)
 
@@ -121,7 +121,7 @@ def pose(scene: Scene, i: int, random: np.random.Generator) -> NDArray[np.float6
     elif scene.motion == "shaking":
         place = place + 0.02 * random.standard_normal(3)
         yaw, pitch = radians(1.0) * random.standard_normal(2)
-    elif scene.motion == "approach":  # ends so near that the camera is blind to the pole
+    elif scene.motion == "approach":  # ends so near that the camera no longer sees the pole
         place[0] = -(scene.distance + (0.2 - scene.distance) * min(1.0, 1.5 * i / (scene.frames - 1)))
         place[1] = 0.0
     elif scene.motion != "still":
@@ -166,7 +166,7 @@ def true_depth(scene: Scene, T: NDArray, du: float = 0.0, dv: float = 0.0) -> ND
 def measured(
     scene: Scene, T: NDArray, random: np.random.Generator, seed: list[int]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return what the camera makes of it: depth in metres (0: none) and the reason of each pixel.
+    """Return the camera's image: depth in metres (0: none) and the reason of each pixel.
 
     seed: of the run and of the frame, for a camera that draws its own numbers.
     """
@@ -189,7 +189,7 @@ def measured(
 
 
 def flying(scene: Scene, T: NDArray, depth: NDArray, random: np.random.Generator) -> NDArray[np.float64]:
-    """Let pixels that see two surfaces measure something between them, as cameras with wide pixels or windows do."""
+    """Let pixels on two surfaces measure a depth in between, as cameras with wide pixels or windows do."""
     corners = [true_depth(scene, T, du, dv) for du in (-0.4, 0.4) for dv in (-0.4, 0.4)]
     near, far = np.min([depth, *corners], axis=0), np.max([depth, *corners], axis=0)
     mixed = (far > near + 0.05) & (random.random(depth.shape) < 0.5)
@@ -200,7 +200,7 @@ def flying(scene: Scene, T: NDArray, depth: NDArray, random: np.random.Generator
 
 
 def smoothed(noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return noise that is alike over about a pixel on each side, of the same size."""
+    """Return noise correlated over about a pixel on each side, of equal size."""
     kernel = np.exp(-0.5 * (np.arange(-4, 5) / 1.0) ** 2)
     kernel /= np.sqrt((kernel**2).sum())
     for axis in (0, 1):
@@ -209,7 +209,7 @@ def smoothed(noise: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def shaken(T: NDArray, noise: tuple[float, float], random: np.random.Generator) -> NDArray[np.float64]:
-    """Return the pose that a tracker with this noise gives."""
+    """Return the pose from a tracker with this noise."""
     metres, degrees = noise
     off = np.eye(4)
     off[:3, :3] = rotation(*np.radians(degrees * random.standard_normal(3)))
@@ -218,14 +218,14 @@ def shaken(T: NDArray, noise: tuple[float, float], random: np.random.Generator) 
 
 
 def start_of(seed: int) -> NDArray[np.float64]:
-    """Return where the scene stands in the world of the map, (4, 4): the grid stands anyhow to the pole."""
+    """Return the scene's pose (4, 4) in the map's world: the grid is arbitrarily placed relative to the pole."""
     start = np.eye(4)
     start[:3, 3] = np.random.default_rng([seed, 77]).uniform(-1, 1, 3)
     return start
 
 
 def frames_of(scene: Scene, seed: int) -> list[Frame]:
-    """Return the frames of a scene with the poses that the map is given."""
+    """Return the frames of a scene with the poses given to the map."""
     random = np.random.default_rng([seed, 77])
     random.uniform(-1, 1, 3)  # of `start_of`
     start = start_of(seed)
@@ -246,15 +246,15 @@ CAMERAS: dict[str, tuple[int, float, float]] = {
     "Kinect 525": (640, 525.0, 0.075),
     "Kinect 585": (640, 585.0, 0.075),
 }
-"""Pixels across, focal length (0: that of the D435) and baseline of the cameras of random scenes."""
+"""Pixels across, focal length (0: the D435's) and baseline of the cameras of random scenes."""
 APART: dict[str, str] = {"camera": "Kinect 585", "noise": "smooth"}
-"""The camera and the noise that no setting was chosen on."""
+"""The camera and the noise on which no setting was chosen."""
 CELLS = (0.02, 0.03, 0.05, 0.1, 0.2)
 POSE_NOISES = ((0.0, 0.0), (0.0, 0.0), (0.003, 0.1), (0.010, 0.3))
 
 
 def random_scene(seed: int, apart: bool = False) -> tuple[str, Scene, float]:
-    """Return a name, a scene and the side of its cells in metres. apart: of the camera or the noise of APART."""
+    """Return a name, a scene and the side of its cells in metres. apart: with the camera or the noise of APART."""
     random = np.random.default_rng([seed, 4711])
     cameras, noises = list(CAMERAS), [*NOISES, "honest"]
     camera, noise = str(random.choice(cameras)), str(random.choice(noises))
@@ -281,14 +281,14 @@ def random_scene(seed: int, apart: bool = False) -> tuple[str, Scene, float]:
 
 
 def with_background(scene: Scene, random: np.random.Generator) -> Scene:
-    """Return the scene before a wall 0.5 to 10 sigma behind (most), one far off, a slanted one, or nothing."""
+    """Return the scene with a wall 0.5 to 10 sigma behind (mostly), a far one, a slanted one, or nothing."""
     kind, sigmas, lean, slant = random.random(), np.exp(random.uniform(np.log(0.5), np.log(10))), *random.random(2)
     if kind > 0.85:
         return replace(scene, gap=np.inf, lean_deg=40 * lean * (kind > 0.92))
     inverse = 1 / scene.distance - sigmas * scene.sigma / scene.distance**2
     gap = 1 / inverse - scene.distance + scene.pole / 2 if inverse > 0.1 else 0.8
     gap = 0.8 if kind > 0.7 else max(gap, 0.6 * scene.pole)
-    most = np.degrees(np.arctan(0.4 * (gap - scene.pole / 2) / scene.along))  # so that it stays before the wall
+    most = np.degrees(np.arctan(0.4 * (gap - scene.pole / 2) / scene.along))  # so that it stays in front of the wall
     slant = 45 * slant if kind > 0.6 else 0.0
     across = abs(scene.axis[1]) * scene.along + 0.01
     slant = min(slant, float(np.degrees(np.arctan(0.4 * gap / across))))
@@ -308,7 +308,7 @@ def box_of(scene: Scene, voxel_size: float) -> tuple[int, int, int, int]:
 
 
 def pixels_of(scene: Scene, camera: PinholeCamera, T: NDArray) -> NDArray[np.float64]:
-    """Return where points (N, 2) of the judged part of the pole are in the image from this pose: column and row."""
+    """Return column and row (N, 2) in the image of points on the judged part of the pole from this pose."""
     points = np.linspace(-scene.along, scene.along, 41)[:, None] * scene.axis
     x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)

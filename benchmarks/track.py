@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking on recordings that bring poses: error, share of frames that are lost, processor time; next to peers.
+"""Tracking on recordings with poses: error, share of lost frames, processor time; against peers.
 
     python benchmarks/track.py RECORDING [RECORDING ...] [--frames A:B:S] [--peers] [--json] [setting=value ...]
 
-Peers, where they are installed (`pip install small_gicp kiss-icp`) and the recording has depth images: small_gicp's
-GICP of points on a Gaussian voxel map (points and voxels of 0.05 m, even motion as its start), KISS-ICP as it is, and
-OpenCV's projective association from image to image (cv2).
-Errors are in metres, after rigid alignment (ATE) and without (off: the first poses laid on each other, at most).
+Peers, if installed (`pip install small_gicp kiss-icp`) and if the recording has depth images: small_gicp's GICP of
+points on a Gaussian voxel map (points and voxels of 0.05 m, starting from constant velocity), KISS-ICP with its
+defaults, and OpenCV's projective association from image to image (cv2).
+Errors are in metres, after rigid alignment (ATE) and without (off: largest error with the first poses aligned).
 """
 
 import argparse
@@ -31,7 +31,7 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracker
 
 Track = Callable[[AnyFrame], NDArray[np.float64] | None]
-"""Takes a frame; returns its pose (4, 4) in a world of its own, None if it is lost."""
+"""Takes a frame; returns its pose (4, 4) in the tracker's own world, None if lost."""
 
 
 def stereovox(settings: dict[str, Any]) -> Track:
@@ -115,7 +115,7 @@ PEERS: dict[str, Callable[[], Track]] = {"small_gicp": small_gicp, "kiss_icp": k
 
 
 def points_of(frame: AnyFrame) -> NDArray[np.float64]:
-    """Return every fourth pixel of a depth image in both directions that has a value up to 5 m, (N, 3)."""
+    """Return the points (N, 3) of every fourth pixel, in both directions, with a depth up to 5 m."""
     assert isinstance(frame, Frame)
     depth = np.where((frame.depth == 0) | (frame.depth == 65535), np.nan, frame.depth * frame.depth_scale)
     points = frame.camera.back_project(depth)[2::4, 2::4].reshape(-1, 3)
@@ -132,7 +132,7 @@ def run(frames: Iterable[AnyFrame], make: Callable[[], Track]) -> dict[str, floa
         pose = track(frame)
         times.append(1e3 * (time.process_time() - start))
         if pose is None:
-            lost += number > 0  # the first one counts from the second on
+            lost += number > 0  # the first one counts once the second is tracked
         else:
             poses.append(pose)
             truth.append(frame.T_world_sensor)
@@ -155,7 +155,7 @@ def run(frames: Iterable[AnyFrame], make: Callable[[], Track]) -> dict[str, floa
 
 
 def warm_up(frames: Iterable[AnyFrame], track: Track) -> None:
-    """Track some frames, which compiles."""
+    """Track some frames, to compile."""
     for frame in frames:
         if not frame.fault:
             track(frame)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking with and without an IMU, on recordings and simulations that bring poses: images lost, errors, tilt.
+"""Tracking with and without an IMU, on recordings and simulations with poses: lost images, errors, tilt.
 
     python benchmarks/track_imu.py RECORDING [--frames A:B:S] [--cover FROM:TO:EVERY] [--seeds N] [--json]
 
-The IMU is made from the poses (smooth curves through them, 200 readings a second, the noise, bias and delay of a cheap
-one, drawn by seed), so those must be exact: a simulation. It never is the recording's own. --cover: from the first
-image named to the last one, two of EVERY images are black. Errors are in metres and degrees against the poses, from the
-first image that is tracked.
+The IMU is synthesised from the poses (smooth curves through them, 200 readings a second, noise, bias and delay of a
+cheap one, drawn by seed), so those must be exact: a simulation. It is never the recording's own. --cover: from the
+first image named to the last one, two of EVERY images are black. Errors are in metres and degrees against the poses,
+from the first tracked image.
 """
 
 import argparse
@@ -32,7 +32,7 @@ HZ, NOISE, BIAS, FORCE_NOISE, DELAY_S = 200.0, 0.003, 0.02, 0.05, 0.002
 
 
 def made_imu(frames: Sequence[AnyFrame], seed: int) -> ImuReadings:
-    """Return what an IMU with the camera's axes would have said, the world's z being up."""
+    """Return the readings of an IMU with the camera's axes, in a world with z up."""
     rng = np.random.default_rng(seed)
     stamps = np.array([frame.stamp_ns for frame in frames])
     poses = np.array([frame.T_world_sensor for frame in frames])
@@ -57,7 +57,7 @@ def run(frames: Sequence[AnyFrame], imu: Imu | None) -> dict[str, Any]:
     tilt = np.degrees(np.arccos(np.clip(np.sum(true[0, 2, :3] * poses[0, 2, :3]), -1, 1)))
     return {
         "images": len(found),
-        "lost": len(found) - 1 - len(kept),  # the first one counts from the second on
+        "lost": len(found) - 1 - len(kept),  # the first one counts once the second is tracked
         "off_m": float(np.linalg.norm(off[:, :3, 3], axis=1).max()),
         "off_deg": float(angles_deg(off).max()),
         "tilt_deg": float(tilt),
@@ -66,7 +66,7 @@ def run(frames: Sequence[AnyFrame], imu: Imu | None) -> dict[str, Any]:
 
 
 def covered(frames: Sequence[AnyFrame], cover: str) -> list[AnyFrame]:
-    """Return frames of which two of so many are black."""
+    """Return frames, with two of every EVERY black."""
     first, last, every = map(int, cover.split(":"))
     return [
         replace(frame, depth=np.zeros_like(frame.depth), reason=None)

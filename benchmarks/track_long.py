@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Twenty minutes along an aisle that never returns: do memory and time a frame stay as they are?
+"""Twenty minutes along an aisle that never returns: are memory and time per frame constant?
 
     python benchmarks/track_long.py [--minutes 20] [--stereo] [--width 160] [--speed 0.5] [--json]
 
-A camera walks through ever new scenery (pilasters, boxes, beams at random) at 15 Hz, with the errors that a D435 has
-after its pixels were averaged to this size, or as a pair of grey images (--stereo --width 320), and is tracked; there
-is no loop. Figures by the minute: resident memory, CPU time of `Tracker.add` in milliseconds a frame, frames that were
-lost in it, and how far off the position is, by the way so far. The second minute is the measure for the last: in the
-first, kernels are compiled and tables grow.
+A camera walks through ever new scenery (random pilasters, boxes, beams) at 15 Hz, with the errors of a D435 whose
+pixels were averaged to this size, or as a pair of grey images (--stereo --width 320), and is tracked; there is no loop.
+Figures by the minute: resident memory, CPU time of `Tracker.add` in milliseconds a frame, lost frames, and the position
+error, by the path so far. The second minute is the reference for the last: in the first, kernels are compiled and
+tables grow.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from stereovox.simulate.scene import Scene, Solid, box
 HZ = 15
 MINUTE = 60 * HZ
 SECTION_M, AROUND = 10.0, 2
-"""Length of a section of the aisle, and how many are built before and behind the camera's own."""
+"""Length of a section of the aisle, and how many are built ahead of and behind the camera's own."""
 HALF_M, HIGH_M, THICK_M = 1.6, 2.7, 0.3
 """Half the aisle's width, its height, and the thickness of its walls."""
 EYE_M = 1.3
@@ -45,7 +45,7 @@ MAX_RANGE_M = 6.0
 
 @lru_cache(maxsize=2 * AROUND + 2)
 def section(number: int) -> list[Solid]:
-    """Return the solids of one section of the aisle, at random by its number."""
+    """Return the solids of one section of the aisle, randomised by its number."""
     random = np.random.default_rng([7, number + AROUND])
     start, end = number * SECTION_M, (number + 1) * SECTION_M
     solids = [
@@ -70,7 +70,7 @@ def section(number: int) -> list[Solid]:
 
 @lru_cache(maxsize=1)
 def scenery(number: int) -> Scene:
-    """Return what can be seen from a section, walls at both ends of it."""
+    """Return the scenery visible from a section, with walls at both ends."""
     first, last = (number - AROUND) * SECTION_M, (number + AROUND + 1) * SECTION_M
     ends = [box("end", f"end {x:g}", (x, -2, 0), (x + THICK_M, 2, HIGH_M)) for x in (first, last)]
     around = range(number - AROUND, number + AROUND + 1)
@@ -122,7 +122,7 @@ class Walk:
 
 
 def track(walk: Walk, count: int) -> dict:
-    """Track `count` frames; return the figures of every minute, and print them on the way."""
+    """Track `count` frames; return the figures of every minute, printing them on the way."""
     tracker = sv.Tracker(max_range=MAX_RANGE_M, **{"noise.subpixel": walk.sensor.subpixel})
     process, minutes = psutil.Process(), []
     cpu, lost = np.full(count, np.nan), np.zeros(count, bool)  # touched now, not while memory is watched
@@ -157,7 +157,7 @@ def track(walk: Walk, count: int) -> dict:
 
 
 def flatness(minutes: list[dict]) -> dict[str, float]:
-    """Return by how much memory and time of the last minute differ from those of the second, per cent."""
+    """Return the change in per cent of memory and time from the second minute to the last."""
     if len(minutes) <= 2:
         return {}
     second, last = minutes[1], minutes[-1]

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far one input travels through the source until it is in the map: a depth image, a stereo pair, a lidar scan.
+"""The path of one input through the source into the map: a depth image, a stereo pair, a lidar scan.
 
     python benchmarks/trips.py [--depth FOLDER] [--stereo DRIVE] [--scan LOG] [--files] [--house] [--json]
 
-Without recordings, small made ones: a 7-Scenes folder, a KITTI odometry sequence, a CARMEN log. Counted by running,
-with `sys.setprofile`, in a process that made the trip before: modules are imported and kernels compiled. Two trips:
+Without recordings, small generated ones: a 7-Scenes folder, a KITTI odometry sequence, a CARMEN log. Counted by
+running, with `sys.setprofile`, in a process that has made the trip before: modules are imported and kernels compiled.
+Two trips:
 
     first   a new mapper is made and takes its first frame, which an open recording reads
     next    a mapper with WARM frames takes one more
 
-files: source files with a function that is entered, kernels included where Python calls them. lines: what these files
-hold. moves: how often a function is entered that lies in another file than the one entered before. --house adds what
-`benchmarks/house.py` says. A later checkout is measured with `PYTHONPATH=OTHER/src`.
+files: source files with an entered function, including kernels called from Python. lines: length of these
+files. moves: number of calls into another file than the previous call's. --house adds the figures of
+`benchmarks/house.py`. A later checkout is measured with `PYTHONPATH=OTHER/src`.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ Maker = Callable[[], Any]
 
 @dataclass(frozen=True)
 class Trip:
-    """Which files were entered, in order, the lines they hold, and the moves between them."""
+    """Entered files, in order, their lines, and the moves between them."""
 
     files: list[str]
     lines: int
@@ -74,7 +75,7 @@ def main() -> None:
 
 
 def inputs_of(arguments: argparse.Namespace, folder: Path) -> dict[str, tuple[Reader, Maker]]:
-    """Return how each input is read by its number, and how its mapper is made."""
+    """Return a reader by number and a mapper factory for each input."""
     images = sv.open_source(arguments.depth or made_depth(folder / "depth"))
     pairs = sv.open_source(arguments.stereo or made_stereo(folder / "drive"))
     scans = open_robot(arguments.scan or made_log(folder / "made.clf")).scans
@@ -97,13 +98,13 @@ def pair_of_trips(read: Reader, make: Maker) -> dict[str, Trip]:
 
 
 def taken(mapper: Any, seen: Any) -> None:
-    """Map one input that must not be refused: such a trip ends early."""
+    """Map one input that must not be refused: a refusal ends the trip early."""
     report = mapper.add(seen)
     assert report.refused is None, report.detail
 
 
 def traced(trip: Callable[[], None]) -> Trip:
-    """Return what `trip` enters."""
+    """Return the files and functions entered by `trip`."""
     files, moves, before = dict[str, None](), 0, ""
 
     def entered(frame: FrameType, event: str, _: Any) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of a building of some million cells a browser gets at first: python benchmarks/viewer_detail.py."""
+"""Data that a browser first gets of a building of several million cells: python benchmarks/viewer_detail.py."""
 
 from contextlib import closing
 from time import process_time

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run a target on bytes: what it may raise, how long it may take, how much memory."""
+"""Run a target on bytes, with limits on its exceptions, time and memory."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from stereovox.errors import StereovoxError
 from targets import Target
 
 MAX_SECONDS = 1.0
-"""Of processor time, in all threads: a busy machine must not look like a hang."""
+"""Processor time over all threads: a busy machine must not look like a hang."""
 MAX_GROWTH = 1 << 30
-"""Bytes by which the peak of the process may grow in one run."""
+"""Largest growth of the process's peak memory in one run, in bytes."""
 
 
 class Unbounded(AssertionError):  # noqa: N818 - reads as what happened
-    """A reader took too long or too much."""
+    """A reader took too much time or memory."""
 
 
 def check(target: Target, data: bytes, folder: Path, most_seconds: float = MAX_SECONDS) -> str:
-    """Return `read` or `refused`; raises what the target raised, and Unbounded, if that is not allowed."""
+    """Return `read` or `refused`; raises the target's forbidden exceptions, and Unbounded."""
     memory, start = peak_bytes(), time.process_time()
     try:
         target.read(data, folder)
@@ -38,5 +38,5 @@ def check(target: Target, data: bytes, folder: Path, most_seconds: float = MAX_S
 
 
 def peak_bytes() -> int:
-    """Return the most memory this process has had so far."""
+    """Return the peak memory of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files and folders for random calls: sound ones of every kind, damaged copies of them, and strange names."""
+"""Files and folders for random calls: valid ones of every kind, damaged copies of them, and strange names."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from targets import (
 MAX_CHANGED = 200_000
 """Bytes of the largest file that is damaged."""
 COPIES = 40
-"""Damaged copies of the sound files, each time the files are made anew."""
+"""Number of damaged copies of the valid files, each time the files are renewed."""
 STRANGE = ("a name with spaces", "what?depth_scale=1&x", "R&D [old] (2)", "naïve-поза-🗺", "-minus",
            "new\nline", "%s{0}", "'quoted' \"twice\"", "x" * 200, "non-utf8-\udcff\udcfe",
            "\x1b[31mred", "a=b,c;d", ".hidden")  # fmt: skip
@@ -67,7 +67,7 @@ SUFFIXES = ("", ".txt", ".ply", ".pcd", ".png", ".pgm", ".npy", ".npz", ".bag", 
 
 
 class Files:
-    """A folder with all of them. Sound ones are made once; `renew` brings them back and damages copies anew."""
+    """A folder with all files. Valid ones are made once; `renew` restores them and makes new damaged copies."""
 
     def __init__(self, folder: Path):
         self.folder, self._sound = folder, folder.with_name("sound")
@@ -77,7 +77,7 @@ class Files:
             make(place)
 
     def renew(self, dice: random.Random) -> None:
-        """Make the folder anew, with other damage."""
+        """Rebuild the folder with different damage."""
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.copytree(self._sound, self.folder, symlinks=True)
         sound = sorted(os.listdir(self.folder))
@@ -95,7 +95,7 @@ class Files:
         _mixed(*(self.folder / dice.choice(self._recordings) for _ in range(2)), self.folder / "mixed")
 
     def names(self, dice: random.Random) -> Callable[[str], str]:
-        """Return a function that draws a name: `sound`, or anything for any other kind."""
+        """Return a function that draws a name: of a valid file for kind `sound`, else of anything."""
         names = sorted(os.listdir(self.folder), key=ascii)
         sound = sorted(os.listdir(self._sound))
 
@@ -199,7 +199,7 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "depth.npy": _npy, "points.graph": _text(GRAPHS[0]), "text": _text(CAMERA * 20),
     **{f"cloud{ending}": _exported for ending in EXPORTS if ending in (".bt", ".ot", ".ply", ".pcd", ".npz", ".glb")},
 }  # fmt: skip
-"""Name -> what makes a sound file or folder of it."""
+"""Name -> maker of a valid file or folder."""
 
 
 def _made(make: Callable[[Path], object], folder: Path) -> None:
@@ -215,7 +215,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _damaged(source: Path, target: Path, dice: random.Random) -> None:
-    """Copy a file under another ending, or damaged, or a folder with files that are damaged, missing or renamed."""
+    """Copy a file under another ending, or damaged, or a folder with damaged, missing or renamed files."""
     if source.is_file():
         suffix = dice.choice(SUFFIXES) if dice.random() < 0.3 else source.suffix
         target = target.with_suffix(suffix)

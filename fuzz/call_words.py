@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random words for the command line: its own options, with values that fit, that nearly fit, and others."""
+"""Random words for the command line: its own options, with valid, nearly valid and arbitrary values."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from stereovox.cli import command_module, commands
 
 Draw = Callable[[str], str]
 WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "export": 3}
-"""How often a command is called, compared with others (1)."""
+"""Relative frequency of a command; others have 1."""
 SLOW = ("demo", "bench", "reproduce", "ros2", "view")
-"""Commands that run for long, or until they are stopped, if nothing is wrong: each call gets a wrong word."""
+"""Commands that run long, or until stopped, unless something is wrong: each call gets an invalid word."""
 SIMULATIONS = ("sim:nothing", "sim:", "realsense:", "sim:room?noise=x", "sim:room?seed=1&fx=0")
 NUMBERS = ("0", "1", "-1", "0.05", "0.5", "3", "nan", "inf", "-inf", "1e308", "1e-320", "1e-9", "x", "",
            "٣", "1_0")  # fmt: skip
@@ -65,7 +65,7 @@ PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/m
           "a?b?c")  # fmt: skip
 ENDINGS = {"localize": ".tum", "slam": ".yaml", "grid": ".yaml", "ground": ".yaml", "calibrate": ".toml",
            "simulate": ".mcap", "distance": ".npz", "picture": ".png"}  # fmt: skip
-"""Ending of what a command writes, if it is not a map."""
+"""Ending of a command's output, if it is not a map."""
 FITTING = {
     "SOURCE": ("7scenes", "tum", "icl", "sun3d", "rig", "asl", "kitti_raw", "scan.sens", "log.klg", "bench.raw",
                "replica", "open3d", "nerf", "colmap", "tartanair", "stray", "plain", "pair", "rtabmap", "rtabmap.db",
@@ -75,7 +75,7 @@ FITTING = {
     "MAP": ("map.svox", "map.svox", "out0.svox", "out1.svox", "cloud.svox", "floor.yaml"),
     "PATH": ("map.svox", "floor.yaml", "depth.npy", "poses.txt", "camera.toml", "profile.toml", "kalibr.yaml", "pair"),
 }  # fmt: skip
-"""Names of sound files by what an argument wants."""
+"""Names of valid files by kind of argument."""
 SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".bag", ".tum", ".rrd",
             ".glb", ".gz", "")  # fmt: skip
 
@@ -112,7 +112,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
 
 
 def _words_of(command: str, action: Any, draw: Draw, dice: random.Random) -> list[str]:
-    """Return an argument with a value, or nothing if it is left out."""
+    """Return an argument with a value, or nothing if omitted."""
     if not action.option_strings:
         many = dice.choice((1, 1, 2)) if action.nargs in ("+", "*", "...") else 1
         return [_value(command, action, draw, dice) for _ in range(many)]
@@ -126,7 +126,7 @@ def _words_of(command: str, action: Any, draw: Draw, dice: random.Random) -> lis
 
 
 def _value(command: str, action: Any, draw: Draw, dice: random.Random) -> str:
-    """Return a value that is meant for the argument, mostly; else any."""
+    """Return a value, usually one meant for the argument."""
     what = f"{action.dest} {action.metavar}"
     if action.option_strings and dice.random() < 0.15:
         return dice.choice((*NUMBERS, *LISTS, *RANGES, *WORDS, *PLACES))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random calls of all commands on random files: python fuzz/calls.py [--calls N] [--seed S] [--json].
 
-The files are small recordings of every layout, maps, clouds and logs; copies that are cut off, damaged, renamed, mixed
-or lack a part; and names that nobody expects. A call must end with 0 or 2, and with 2 its last line must be the only
-error, of at most 300 characters, and name something of the call. Ends with 1 where one did not.
+The files are small recordings of every layout, maps, clouds and logs; copies that are truncated, damaged, renamed,
+mixed or lack a part; and unexpected names. A call must end with 0 or 2, and with 2 its last line must be the only
+error, of at most 300 characters, and name something of the call. Ends with 1 if one did not.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ HERE = Path(__file__).resolve().parent
 PLACES = (HERE, HERE.parent / "tests/helpers", HERE.parent / "tests/sources/rgbd")
 MAX_LINE, MAX_SECONDS, MAX_MEMORY = 300, 30, 6 << 30
 RENEWED = 150
-"""Calls after which the files are made anew, since commands write over them."""
+"""Calls after which the files are renewed, because commands overwrite them."""
 
 
 class Outcome(NamedTuple):
-    """What a call did. status: None if it raised. printed: all that came out on stderr."""
+    """The outcome of a call. status: None if it raised. printed: its whole stderr."""
 
     words: list[str]
     status: int | None
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     seconds: float
 
     def problem(self) -> str:
-        """Return what must not happen, empty if nothing did."""
+        """Return the violation, empty if there is none."""
         errors = [line for line in self.printed.splitlines() if line.startswith("stereovox: ")]
         if self.status is None or "Traceback" in self.printed:
             return "raised"
@@ -58,14 +58,14 @@ class Outcome(NamedTuple):
         parts = [part for word in self.words for part in (word, *re.split(r"[=?/,]", word.strip("-")))]
         parts += [part.replace("-", "_") for part in parts]  # a setting of that name
         parts += [Path(part).stem for part in parts]  # a recording in a file of that name
-        parts += os.listdir()  # a message may name a file that an option names, or that lies beside
+        parts += os.listdir()  # a message may name a file from an option, or a neighbour
         named = any(part[:12] in line or repr(part[:12])[1:-1] in line for part in parts if part)
-        other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # which one of these names
+        other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # the file named by one of these
         return named or other_file is not None or "" in self.words or not self.words or "pip install" in line
 
 
 def main() -> int:
-    """Make the calls and print those that went wrong, or with --json one object."""
+    """Make the calls and print the failed ones, or with --json one object."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--calls", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
@@ -85,7 +85,7 @@ def main() -> int:
 
 
 def run(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, Counter[str]], list[str]]:
-    """Return how many calls ended how, by status and by command, and those that must not end so."""
+    """Return the numbers of outcomes, by status and by command, and the violations."""
     from call_files import Files
     from call_words import call
 
@@ -114,11 +114,11 @@ def run(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, Counter[
 
 
 class TooLong(BaseException):
-    """A call did not end."""
+    """A call did not end in time."""
 
 
 def attempt(words: Sequence[str], captured: Path) -> Outcome:
-    """Make one call, with all that it and its libraries print in the file `captured`."""
+    """Make one call, with all output of it and its libraries in the file `captured`."""
     from stereovox.cli import main as command_line
 
     start, kept = time.monotonic(), [os.dup(1), os.dup(2)]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random images, pairs, clouds and scans into mappers of all kinds: `python fuzz/frames.py --seconds 3600 --seed 1`.
 
-What must hold: no exception, not even a warning; a refused frame leaves every bit of the map as it was and says why in
-one line; no call takes longer than a second; no cell leaves its range. What does not is printed, and the exit status is
-then 1. Frames come in batches, each with new mappers and dice of its own: `--seed S --batch B --frames N` makes the
-first N frames of one again. Batches run in a process of their own, which is ended when a call does not come back.
+What must hold: no exception, not even a warning; a refused frame leaves every bit of the map unchanged and gives the
+reason in one line; no call takes longer than a second; no cell leaves its range. Violations are printed, and the exit
+status is then 1. Frames are made in batches, each with new mappers and its own dice: `--seed S --batch B --frames N`
+repeats the first N frames of one. Batches run in a separate process, which is killed if a call does not return.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from stereovox.frame import Cloud, Frame, Scan, StereoFrame
 SEEN = Frame, Scan, StereoFrame, Cloud
 SLOW_S = 1.0
 SLOWEST = 5
-"""Calls that are kept as the slowest."""
+"""Number of slowest calls kept."""
 BATCH = 20_000
 RENEWED = 200
-"""Calls after which a map is begun anew, lest all of them be large."""
+"""Calls after which a map is restarted, so that not all of them are large."""
 UNFIT = "(settings do not fit the camera)"
-"""What a ConfigError counts as: it is raised, for it would come with every frame."""
+"""How a ConfigError is counted: it is raised, because it would repeat with every frame."""
 WARM = 5000
-"""Frames that are made and not timed: kernels are compiled meanwhile. One that is compiled later is a slow call."""
+"""Frames at the start that are not timed, while kernels are compiled. Later compilation is a slow call."""
 Told = Callable[[str], None]
 
 
 @dataclass
 class Tally:
-    """What was seen.
+    """The results so far.
 
-    slowest: (milliseconds, frame, what) of calls, the lesser of the time by the clock and by the processor, which other
-    programs use too. A call is slow where it is over SLOW_S. bad: one line for each frame after which something did not
-    hold. hung: one for each call that did not come back.
+    slowest: (milliseconds, frame, what) of calls, the lesser of wall time and processor time, because other programs
+    use both. A call is slow if it takes over SLOW_S. bad: one line for each frame after which an invariant was
+    violated. hung: one for each call that did not return.
     """
 
     frames: Counter[str] = field(default_factory=Counter)
@@ -66,13 +66,13 @@ class Tally:
     hung: list[str] = field(default_factory=list)
 
     def took(self, seconds: float, place: str, what: str) -> None:
-        """Note how long a call took."""
+        """Record the time of a call."""
         self.slow += seconds > SLOW_S
         if len(self.slowest) < SLOWEST or 1e3 * seconds > self.slowest[-1][0]:
             self.slowest = nlargest(SLOWEST, [*self.slowest, (round(1e3 * seconds, 1), place, what)])
 
     def join(self, other: Tally) -> None:
-        """Take over what another one saw."""
+        """Add another tally."""
         for mine, theirs in ((self.frames, other.frames), (self.taken, other.taken), (self.refused, other.refused)):
             mine.update(theirs)
         self.slowest = nlargest(SLOWEST, self.slowest + other.slowest)
@@ -83,7 +83,7 @@ class Tally:
 
     @property
     def failed(self) -> bool:
-        """Whether something did not hold."""
+        """Whether an invariant was violated."""
         return bool(self.bad or self.hung or self.slow or self.changed_by_refused)
 
     def as_dict(self) -> dict[str, Any]:
@@ -114,9 +114,9 @@ class Tried:
         self._begin()
 
     def add(self, things: Sequence[Any], tally: Tally, place: str, timed: bool = True) -> None:
-        """Offer one thing from each caller and note in `tally` what they did.
+        """Offer one thing from each caller and record the results in `tally`.
 
-        Raises AssertionError where something does not hold.
+        Raises AssertionError if an invariant is violated.
         """
         before, known = self._digest, self._offered_so_far
         start, busy_start = perf_counter(), process_time()
@@ -141,12 +141,12 @@ class Tried:
             self.renew()
 
     def renew(self) -> None:
-        """Begin with an empty map."""
+        """Start with an empty map."""
         self.close()
         self._begin()
 
     def close(self) -> None:
-        """Give back what the map holds on the disk."""
+        """Release the map's files on disk."""
         if hasattr(self.mapper.map, "close"):
             self.mapper.map.close()
 
@@ -175,13 +175,13 @@ class Tried:
 
 
 def check(holds: bool, otherwise: str) -> None:
-    """Raise AssertionError with `otherwise` if something does not hold."""
+    """Raise AssertionError with `otherwise` unless `holds`."""
     if not holds:
         raise AssertionError(otherwise)
 
 
 def digest(voxel_map: Any) -> tuple[Any, ...]:
-    """Return what a map is, in a few numbers; raises AssertionError where a cell is out of range."""
+    """Return a digest of a map in a few numbers; raises AssertionError if a cell is out of range."""
     coords, cells = voxel_map.storage.tiles() if hasattr(voxel_map.storage, "tiles") else voxel_map.storage.blocks()
     limits, format = voxel_map.config.map, voxel_map.storage.cell_format
     lowest, highest = format.stored(np.array([limits.log_odds_min, limits.log_odds_max])).tolist()
@@ -196,7 +196,7 @@ def digest(voxel_map: Any) -> tuple[Any, ...]:
 
 
 def described(thing: Any) -> str:
-    """Return in a few words what was offered."""
+    """Return a short description of the offered thing."""
     with suppress(AttributeError, KeyError):
         names = {Frame: "depth", StereoFrame: "left", Cloud: "points", Scan: "ranges"}
         image = getattr(thing, names[type(thing)])
@@ -206,7 +206,7 @@ def described(thing: Any) -> str:
 
 
 def thing_for(grid: bool, maker: Maker, chance: float) -> Any:
-    """Return a frame or a scan, whatever suits the mapper, and now and then what does not."""
+    """Return a frame or a scan that suits the mapper, and occasionally one that does not."""
     if chance < 0.02:
         return maker.nonsense() if chance < 0.01 else maker.scan()
     return maker.scan() if grid and chance < 0.7 else maker.frame()
@@ -220,10 +220,10 @@ def run(
     odd_cameras: bool = True,
     alive: Callable[[int], bool] = lambda number: True,
 ) -> Tally:
-    """Offer so many things to mappers in turn and return what was seen; a warning counts as an exception.
+    """Offer `frames` things to mappers in turn and return the results; a warning counts as an exception.
 
     seed: one number, or one of a run and one of a batch. alive: called before each call with the number of frames so
-    far; reports whether to go on.
+    far; returns whether to continue.
     """
     maker, rng, tally, number = Maker(seed, odd_cameras), np.random.default_rng(seed), Tally(), 0
     tried, shares = [Tried(kind) for kind in kinds], np.array([kind.share for kind in kinds])
@@ -246,7 +246,7 @@ def run(
 
 
 def warm_up(seed: Any, kinds: Sequence[Kind], odd_cameras: bool, alive: Callable[[int], bool]) -> None:
-    """Compile the kernels: of ordinary frames, and of some of every kind that need rare ones."""
+    """Compile the kernels: with ordinary frames, and with some of every kind that need rare kernels."""
     for kind in kinds:
         mapper = kind.make()
         for camera, dtype in product(RARE, DTYPES if odd_cameras else ()):
@@ -264,13 +264,13 @@ def what_happened(error: Exception) -> str:
 
 
 def without(words: Iterable[str]) -> tuple[list[Kind], bool]:
-    """Return the kinds whose names hold none of the words, and whether odd cameras are drawn."""
+    """Return the kinds whose names contain none of the words, and whether odd cameras are drawn."""
     kinds = [kind for kind in KINDS if not any(word in kind.name for word in words)]
     return kinds, "odd cameras" not in set(words)
 
 
 def main() -> int:
-    """Run as the command line says; return the exit status."""
+    """Run by the command line; return the exit status."""
     from watched import Watched
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

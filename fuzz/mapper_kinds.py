@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kinds of mappers that random frames are offered to."""
+"""The kinds of mappers to which random frames are offered."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import stereovox as sv
 from stereovox.mapper import GridMapper
 
 SELDOM = 0.1
-"""Share of what has tiles on the disk: looking at all of it is slow."""
+"""Share of kinds with tiles on disk: inspecting these fully is slow."""
 ANYWHERE = {"trust.ordered": False, "trust.max_speed_mps": 1e12, "trust.max_turn_dps": 1e12, "trust.settle_s": 0}
-"""Else nearly all frames were refused for jumps."""
+"""Otherwise nearly all frames would be refused for jumps."""
 SMALL = {"voxel_size": 0.25, "max_range": 4.0, "stereo.disparities": 16, **ANYWHERE}
 WINDOW = {"window.size": (12, 12, 6), "window.trigger": 1}
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A mapper: its profile and settings, whether it makes a floor's grid.
+    """A kind of mapper: its profile and settings, and whether it makes a floor's grid.
 
-    callers: threads that add to it at the same time. share: how often it has its turn, against 1 of most others.
+    callers: threads that add to it concurrently. share: frequency of its turns, relative to 1 for most others.
     """
 
     name: str

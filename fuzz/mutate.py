@@ -17,7 +17,7 @@ WORDS = (
     b"<<: *a", b"!!python/object/apply:os.system ['false']", b"../../../../etc/passwd", b"/etc/passwd", b"\0",
     b"\x1b[2J", b"\r\n", b"\n", b"'", b'"', b"#", b"\xff\xfe", b"\xef\xbb\xbf", "٣".encode(), b"1_0", b"1:1:1:1",
 )  # fmt: skip
-"""What a field may be replaced by."""
+"""Replacements for a field."""
 INTEGERS = (0, 1, 2, 7, 8, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-38, 1e38, float("inf"), float("-inf"), float("nan"), 1e300)
 
@@ -31,7 +31,7 @@ def mutated(data: bytes, dice: random.Random) -> bytes:
 
 
 def with_right_sums(png: bytes) -> bytes:
-    """Return a PNG whose chunks all have the check sum that belongs to them, as far as it can be told apart."""
+    """Return a PNG with correct checksums in all chunks that can be parsed."""
     fixed, at = bytearray(png), 8
     while at + 12 <= len(fixed):
         (length,) = struct.unpack_from(">I", fixed, at)

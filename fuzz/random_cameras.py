@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random cameras and stereo pairs: small ordinary ones, and odd ones of any shape that a constructor lets pass."""
+"""Random cameras and stereo pairs: small ordinary ones, and odd ones of any shape that a constructor accepts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stereovox.errors import StereovoxError
 
 BASELINES = (None, None, 0.05, 1e-6, 50.0)
 ODD_SIZES = (1, 1, 2, 3, 7, 16, 40, 97, 400)
-"""Pixels; width and height are drawn one by one."""
+"""Pixels; width and height are drawn separately."""
 ODD_FOCALS = (1e-300, 1e-30, 1e30, 1e300, -20.0, 0.0, np.nan, np.inf)
 LARGE = ((640, 480, 580.0), (848, 480, 420.0), (1280, 720, 640.0), (320, 240, 150.0))
 RARE = (
@@ -25,13 +25,13 @@ RARE = (
     CylindricalCamera(12, 9, 0.5, 0.6, 5.5, 4.0, 1e-6),
     sv.PinholeCamera(9, 7, 9.0, 9.0, 4.0, 3.0, correction=DepthCorrection("scale", (0.0,) * 6)),
 )  # fmt: skip
-"""Cameras that need what most do not: cells so far to the side that their numbers take 64 bits, and a correction."""
+"""Cameras with rare needs: cells so far to the side that their indices take 64 bits, and a correction."""
 TRIES = 50
-"""Odd cameras that are drawn until one of them passes."""
+"""Most odd cameras drawn until one is accepted."""
 
 
 class RandomCameras:
-    """Draws cameras. odd: among them some that nobody builds, but that can be written down."""
+    """Draws cameras. odd: include some that nobody builds but anyone can specify."""
 
     def __init__(self, rng: np.random.Generator, odd: bool = True):
         self._rng, self._odd_too = rng, odd
@@ -42,12 +42,12 @@ class RandomCameras:
             for _ in range(TRIES):
                 try:
                     return self._one_of((self._odd_pinhole, self._odd_spherical, self._odd_cylindrical))()
-                except StereovoxError:  # nothing but this may come out of a constructor
+                except StereovoxError:  # a constructor may raise nothing else
                     continue
         return self._wide() if self._chance(0.15) else self._pinhole()
 
     def large(self) -> VirtualCamera:
-        """Return a camera of the size that real ones have."""
+        """Return a camera of realistic size."""
         width, height, focal = self._one_of(LARGE)
         if self._chance(0.2):
             kind = self._one_of((SphericalCamera, CylindricalCamera))
@@ -55,7 +55,7 @@ class RandomCameras:
         return sv.PinholeCamera(width, height, focal, focal, width / 2, height / 2, 0.05)
 
     def pair(self, model: str | None) -> StereoPair:
-        """Return a stereo pair: rectified, or with fisheye lenses that are rectified to a camera of the model."""
+        """Return a stereo pair: rectified, or with fisheye lenses to be rectified to a camera of the model."""
         width, height = int(self._rng.integers(20, 70)), int(self._rng.integers(8, 40))
         if model is None:
             return StereoPair(sv.PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2, 0.1))
@@ -106,15 +106,15 @@ class RandomCameras:
         return kind(width), kind(height)
 
     def _focal(self) -> float:
-        """Return pixels from a thousandth to ten millions, and now and then what is none."""
+        """Return pixels from a thousandth to ten millions, and occasionally an invalid value."""
         return self._one_of(ODD_FOCALS) if self._chance(0.03) else float(10 ** self._rng.uniform(-3, 7))
 
     def _span(self, widest_deg: float) -> float:
-        """Return an angle in radians, as often a narrow one as a wide one."""
+        """Return an angle in radians, narrow and wide ones equally often."""
         return float(np.radians(10 ** self._rng.uniform(-5, np.log10(widest_deg))))
 
     def _middle(self, size: Any) -> float:
-        """Return where the axis meets the image, or does not."""
+        """Return a principal point, possibly outside the image."""
         if self._chance(0.1):
             return self._one_of((np.nan, np.inf, -1e300, 1e6, -1e4, 1e30))
         return float(self._one_of((0.5, 0.5, 0.5, 0.0, 1.0, self._rng.uniform(-2, 3))) * size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random images, pairs, clouds and scans of a few pixels or points: sound ones, odd ones, and nonsense."""
+"""Random images, pairs, clouds and scans of a few pixels or points: valid ones, odd ones, and nonsense."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from stereovox.frame import AnyFrame, Scan, StereoFrame
 from stereovox.geometry.se3 import from_quaternion, inverse
 
 STRANGE = (0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 1e-45, 3e38, 65535.0, 65536.0, 0.05, 2.0)
-"""Numbers that are not what a sensor says, or just are."""
+"""Numbers at or beyond the limits of a sensor."""
 PLACES = (0, 0, 0, 1, 1, 20, 1e4, 4e5, 1e7)
-"""Metres that a camera is away from the origin."""
+"""Distances of a camera from the origin in metres."""
 ODD_NUMBERS = (np.nan, np.inf, -np.inf, 0, -1, 1e-12, 1e12, 1e308, 10**30, -(10**400), 2**62, "1", None, 1j, [1], True)
 ODD_THINGS = (
     None, "x", b"\x00", 7, 2.5, [], [[1, 2], [3]], {}, object(), np.zeros(0), np.zeros((0, 4)), np.zeros((2, 2, 2, 2)),
@@ -28,14 +28,14 @@ ODD_DTYPES = (
     ">f4", ">u2", "<f8", ">f8", "f2", "i1", "u1", "i2", "i4", "i8", "u8", "?", "c8", "c16", "O", "S3", "g", "M8[s]",
 )  # fmt: skip
 DTYPES, NO_DTYPES = ("f4", "f4", "f8", "u2", "u2"), ("f2", ">f4", ">u2", "i4", "u1")
-"""Kinds of number that depth comes in, and that it must not; whole ones are millimetres."""
+"""Valid and invalid dtypes of depth; integers are millimetres."""
 CLOUD_DTYPES = ("f4", "f4", "f8", "f2", "i4", ">f4")
 LIDARS = (sv.Lidar(), sv.Lidar(), sv.Lidar(0.02, 0.0, 3.0), sv.Lidar(1e-9, 0.1), sv.Lidar(5.0, 0.0, 1e12))
 ROOM_M = np.array([4.0, 3.0, 2.5])
-"""From the origin to the walls of the room that plausible images show."""
+"""Half size of the room shown in plausible images."""
 CAMERAS = 60
 LARGE = 0.003
-"""Share of the depth images that have the size of a real camera."""
+"""Share of depth images of realistic size."""
 SENSORS = ("", "", "", "left", "right", "lidar 1")
 NAMES = ("", "a.png", "two\nlines", "\udc80", "x" * 300)
 STAMP_STEPS = (33_000_000, 33_000_000, 0, -33_000_000, -(10**10), 10**18, 2**63, 0.5)
@@ -43,7 +43,7 @@ STAMP_STEPS = (33_000_000, 33_000_000, 0, -33_000_000, -(10**10), 10**18, 2**63,
 
 
 class Maker:
-    """Makes one thing after another; the same ones for the same seed. odd_cameras: see `RandomCameras`."""
+    """Makes things in sequence; the same for the same seed. odd_cameras: see `RandomCameras`."""
 
     def __init__(self, seed: Any, odd_cameras: bool = True):
         self._rng = np.random.default_rng(seed)
@@ -64,7 +64,7 @@ class Maker:
         return self._spoilt(made) if self._chance(0.25) else self._same(made)
 
     def nonsense(self) -> Any:
-        """Return what is no frame at all."""
+        """Return a non-frame."""
         return self._one_of(ODD_THINGS)
 
     def _one_of(self, choices: Any) -> Any:
@@ -104,7 +104,7 @@ class Maker:
         return StereoFrame(left, right, pair, self._pose(), **self._shared())
 
     def _cloud(self) -> sv.Cloud:
-        """Return a cloud of the room, of random points, or of points that all are strange."""
+        """Return a cloud of the room, of random points, or of strange points only."""
         rng, count = self._rng, int(self._one_of((0, 1, 7, 40, 250, 1500)))
         T = from_quaternion(rng.uniform(-1, 1, 3), rng.normal(size=4)) if self._chance(0.6) else self._pose()
         points = rng.normal(size=(count, 3)) * self._one_of((1.0, 1.0, 1000.0, 1e-4))
@@ -171,7 +171,7 @@ class Maker:
         return T
 
     def _camera(self) -> VirtualCamera:
-        """Return one of a few dozen cameras, for a robot has few; now and then one of them is replaced."""
+        """Return one of a few dozen cameras, because a robot has few; occasionally one is replaced."""
         if self._chance(LARGE):
             return self._shapes.large()
         number = int(self._rng.integers(CAMERAS))
@@ -180,7 +180,7 @@ class Maker:
         return self._cameras[number]
 
     def _same(self, made: Any) -> Any:
-        """Return the frame, now and then with arrays that hold the same in another layout."""
+        """Return the frame, occasionally with equal arrays in another memory layout."""
         if not self._chance(0.2):
             return made
         arrays = [field.name for field in fields(made) if isinstance(getattr(made, field.name), np.ndarray)]
@@ -196,7 +196,7 @@ class Maker:
         return self._one_of(ways)()
 
     def _spoilt(self, made: Any) -> Any:
-        """Return the frame with one field replaced by what does not belong there."""
+        """Return the frame with one field replaced by an invalid value."""
         name = self._one_of([field.name for field in fields(made)])
         old = getattr(made, name)
         new = self._one_of(ODD_THINGS)
@@ -207,7 +207,7 @@ class Maker:
         return replace(made, **{name: new})
 
     def _odd_array(self, array: np.ndarray) -> Any:
-        """Return an array of another kind, shape or layout; some of them mean the same."""
+        """Return an array of another dtype, shape or layout; some are equivalent."""
         ways = (
             lambda: self._of_dtype(array), lambda: self._of_dtype(array), lambda: array[:-1], lambda: array[..., None],
             lambda: array[..., ::-1], lambda: self._laid_out(array), lambda: array.tolist(), lambda: array.T,
@@ -228,7 +228,7 @@ class Maker:
 
 
 def room_points(T_world_sensor: Any, rays: np.ndarray) -> np.ndarray:
-    """Return where rays (N, 3) of a sensor in the room about the origin meet its walls, in the sensor's frame."""
+    """Return the hits of rays (N, 3) of a sensor on the walls of the room around the origin, in the sensor's frame."""
     with np.errstate(all="ignore"):
         directions = rays @ np.asarray(T_world_sensor)[:3, :3].T
         walls = (np.sign(directions) * ROOM_M - np.asarray(T_world_sensor)[:3, 3]) / directions
@@ -236,7 +236,7 @@ def room_points(T_world_sensor: Any, rays: np.ndarray) -> np.ndarray:
 
 
 def room_depth(camera: VirtualCamera, T_world_camera: np.ndarray) -> np.ndarray:
-    """Return the depth (height, width) in metres of the walls of a room about the origin, seen by a camera in it."""
+    """Return the depth (height, width) in metres of the walls of a room around the origin, seen by a camera in it."""
     columns, rows = camera.rays()
     shape = len(rows), len(columns)
     across, down, ahead = np.broadcast_to(columns, shape), *(np.broadcast_to(row[:, None], shape) for row in rows.T)

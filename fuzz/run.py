@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzz the readers for long: python fuzz/run.py [--seconds S] [--target NAME] [--runs N] [--json].
+"""Fuzz the readers at length: python fuzz/run.py [--seconds S] [--target NAME] [--runs N] [--json].
 
-Each target runs in a process of its own. By default changed seeds are tried one by one; with --coverage atheris guides
-the changes by the code they reach, which finds more in each run and runs fewer. What crashes, takes more than a second
-of processor time or more than 1 GiB is kept in fuzz/corpus/TARGET under the name of its hash. Ends with 1 where
-something was found.
+Each target runs in its own process. By default mutated seeds are tried one by one; with --coverage atheris guides
+mutations by the code they reach, which finds more per run but makes fewer runs. Inputs that crash, take more than a
+second of processor time or more than 1 GiB are kept in fuzz/corpus/TARGET under their hash. Ends with 1 if anything was
+found.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ HERE = Path(__file__).resolve().parent
 CORPUS = HERE / "corpus"
 PLACES = (HERE, HERE.parent / "tests/helpers")
 OWN_SHARE = 20
-"""Times that a seed is changed for each time that a file of the corpus is."""
+"""Weight of a seed relative to a file of the corpus."""
 MAX_KEPT = 10
-"""New crashers of one target after which it is given up."""
+"""New crashers of one target after which it is stopped."""
 
 
 def main() -> int:
@@ -101,16 +101,16 @@ class Session:
         (folder / "seeds").mkdir()
         (folder / "place").mkdir()
         self.target, self.kept, self.place = target, CORPUS / name, folder / "place"
-        self.seeds = OWN_SHARE * target.seeds(folder / "seeds")  # what once was slow may still be slower than others
+        self.seeds = OWN_SHARE * target.seeds(folder / "seeds")  # inputs once slow may still be slower than others
         self.seeds += [path.read_bytes() for path in sorted(self.kept.glob("*"))]
         self.counts, self.said, self.places = Counter(), [], []
         self.arguments, self.start, self.slowest = arguments, time.monotonic(), 0.0
-        for seed in dict.fromkeys(self.seeds):  # compiles kernels, imports libraries: none of that is the reader's time
+        for seed in dict.fromkeys(self.seeds):  # compile kernels and import libraries outside the reader's time
             self.try_out(seed, counted=False)
         self.counts.clear()
 
     def run(self) -> None:
-        """Try changed seeds until time or number of runs is over."""
+        """Try mutated seeds until time or runs are used up."""
         if self.arguments.coverage:
             return self.guided()
         from mutate import mutated
@@ -121,7 +121,7 @@ class Session:
         self.tell()
 
     def guided(self) -> None:
-        """The same by atheris, which never comes back."""
+        """The same with atheris, which never returns."""
         import atheris
 
         from mutate import mutated
@@ -147,12 +147,12 @@ class Session:
         atheris.Fuzz()
 
     def is_over(self) -> bool:
-        """Tell whether it was enough."""
+        """Return whether it was enough."""
         late = time.monotonic() - self.start > self.arguments.seconds
         return late or self.counts["runs"] >= self.arguments.runs or len(self.said) >= MAX_KEPT
 
     def one(self, data: bytes) -> None:
-        """Run once, and keep what must not happen."""
+        """Run once, and keep violations."""
         self.counts["runs"] += 1
         if self.counts["runs"] % 500 == 0:
             self.tell()
@@ -187,7 +187,7 @@ class Session:
         self.said.append(f"{path.name}: {said}")
 
     def tell(self) -> None:
-        """Write the counts where the parent looks for them."""
+        """Write the counts to the parent's file."""
         from bounded import peak_bytes
 
         keys = ("runs", "read", "refused", "crashes", "hangs")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One target a parser, all of one shape: bytes go into a file, a reader reads it, and only StereovoxError may come out.
+"""One target per parser, all alike: bytes go into a file, a reader reads it, and only StereovoxError may be raised.
 
-Where plain bytes would not get past a check sum or an index, the bytes are what stands behind it (a message, the cells
-of a map) and the target writes a sound file round them.
+If plain bytes would fail at a checksum or an index, the bytes are the content behind it (a message, the cells of a map)
+and the target writes a valid file around them.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ ROBOT_KINDS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2", "nav_
 
 
 class Target(NamedTuple):
-    """seeds: what is changed, made in an empty folder. read: what a file of such bytes is read by."""
+    """seeds: inputs to mutate, made in an empty folder. read: reader of a file with such bytes."""
 
     seeds: Callable[[Path], list[bytes]]
     read: Callable[[bytes, Path], Any]
@@ -177,7 +177,7 @@ def file_target(name: str, reader: Callable[[Path], Any], *seeds: str | bytes) -
 
 
 def frames_of(source: Any) -> None:
-    """Take the first frames; a fault is reported in one line, and a frame without one has its camera's size."""
+    """Read the first frames; a fault must be one line, and a frame without one must have its camera's size."""
     for i in range(min(len(source), MAX_FRAMES)):
         frame = source.frame(i) if hasattr(source, "frame") else source[i]
         assert frame.fault_detail.isprintable(), "a fault of several lines"
@@ -220,7 +220,7 @@ def manifests(folder: Path) -> list[bytes]:
 
 
 def _resealed(data: bytes) -> bytes:
-    """Give a damaged manifest the digest of what it is now, so that what reads it gets to see the damage."""
+    """Give a damaged manifest its new digest, so that its reader reaches the damage."""
     begun = SEAL.match(data)
     return data if begun is None else b'{"digest": "%s", ' % _digest(data[begun.end() :]) + data[begun.end() :]
 
@@ -229,7 +229,7 @@ PIECES = ("coords/zarr.json", "coords/c/0/0", "cells/zarr.json", "cells/c/0/0", 
 
 
 def read_piece(data: bytes, folder: Path) -> None:
-    """The first byte says which file of the arrays gets the others."""
+    """The first byte selects the array file that gets the others."""
     path = next(saved(folder).glob("cells-[0-9a-f]*")) / PIECES[data[0] % len(PIECES) if data else 0]
     whole = path.read_bytes()
     try:
@@ -245,7 +245,7 @@ def pieces(folder: Path) -> list[bytes]:
 
 
 def read_cells(data: bytes, folder: Path) -> None:
-    """The bytes are coordinates (12 each) and cells of two kinds, in a folder that is sound otherwise."""
+    """The bytes are coordinates (12 each) and cells of two kinds, in an otherwise valid folder."""
     coords = np.frombuffer(data[: len(data) // 12 * 12], "<i4").reshape(-1, 3)
     cells = np.resize(np.frombuffer(data or b"\0", np.uint8), (len(coords), 512)).astype(np.int16) * 131
     path = saved(folder)
@@ -296,7 +296,7 @@ def shards(folder: Path) -> list[bytes]:
 
 
 def read_shard(data: bytes, folder: Path) -> None:
-    """The first byte says which file of a box gets the others; the manifest has its right checksum and size."""
+    """The first byte selects the box file that gets the others; the manifest has its correct checksum and size."""
     files = sorted(boxed(folder).glob("boxes/0/*/*/c/0/0"))
     file, path = files[data[0] % len(files) if data else 0], boxed(folder) / "manifest.json"
     whole, manifest = file.read_bytes(), path.read_bytes()
@@ -348,7 +348,7 @@ def trees(folder: Path) -> list[bytes]:
 
 
 def read_tree(data: bytes, folder: Path) -> None:
-    """The bytes are the nodes of a tree; title and size are right. An odd first byte: `.ot`."""
+    """The bytes are the nodes of a tree; title and size are correct. An odd first byte: `.ot`."""
     ot, body = bool(data and data[0] % 2), data[1:]
     nodes = len(body) // 5 if ot else 1 + sum(byte >> shift & 3 == 3 for byte in body for shift in (0, 2, 4, 6))
     nodes += 0 if ot else sum(byte >> shift & 3 in (1, 2) for byte in body for shift in (0, 2, 4, 6))
@@ -388,7 +388,7 @@ def exported(ending: str, folder: Path) -> list[bytes]:
 
 
 def read_settings(data: bytes, folder: Path) -> None:
-    """The settings in a file of cells that is sound otherwise."""
+    """The settings in an otherwise valid file of cells."""
     export(small_map(), folder / "s.npz")
     with np.load(folder / "s.npz") as parts:
         np.savez(folder / "s.npz", **(dict(parts) | {"settings": np.frombuffer(data, np.uint8)}))
@@ -488,7 +488,7 @@ def db3_bags(folder: Path) -> list[bytes]:
 
 @cache
 def messages() -> list[tuple[str, str, bytes]]:
-    """Topic, type and bytes of messages that fit together."""
+    """Topic, type and bytes of matching messages."""
     ros = Messages(2)
     edges = (
         (START_NS, "odom", "base_link", planar_numbers(1, 2, 0.1)),
@@ -514,7 +514,7 @@ def mcap_bags(folder: Path) -> list[bytes]:
 
 
 def read_message(data: bytes, folder: Path) -> None:
-    """The first byte says which message gets the others; the file round them is sound."""
+    """The first byte selects the message that gets the others; the file around them is valid."""
     number = data[0] % len(messages()) if data else 0
     types = {topic: kind for topic, kind, _ in messages()}
     said = [
@@ -537,7 +537,7 @@ def map_messages() -> list[tuple[str, bytes]]:
 
 
 def read_map_message(data: bytes, folder: Path) -> None:
-    """The first byte says which message the others are; the file round it is sound."""
+    """The first byte selects the message type of the others; the file around it is valid."""
     kind, _ = map_messages()[data[0] % len(map_messages()) if data else 0]
     path = mcap(folder / "map.mcap", {"/a": kind}, [Message("/a", START_NS, data[1:])], Style(chunk=0, summary=False))
     if kind.endswith("OccupancyGrid"):
@@ -572,7 +572,7 @@ def depth_pngs(folder: Path) -> list[bytes]:
 
 
 def depth_files(folder: Path) -> list[bytes]:
-    """Depth as PGM, PFM, TIFF and NumPy arrays; a packed PNG has its own sums to get past (`depth_png`)."""
+    """Depth as PGM, PFM, TIFF and NumPy arrays; a packed PNG has its own checksums to pass (`depth_png`)."""
     image = depth_image(1)
     for name, pixels in (("s.pgm", image), ("s.pfm", image.astype(np.float32)), ("s.tiff", image)):
         write_png(folder / name, pixels)
@@ -588,7 +588,7 @@ def read_depth_file(data: bytes, folder: Path) -> None:
 
 
 def read_pose_text(data: bytes, folder: Path) -> None:
-    """The bytes as a file of poses, and as one of a folder of them."""
+    """The bytes as a file of poses, and as one file of a folder of them."""
     refused = []
     for name in ("p.txt", "p.json", "p.npy"):
         (folder / name).write_bytes(data)
@@ -642,7 +642,7 @@ def grey_pngs(folder: Path) -> list[bytes]:
 
 
 def read_list(name: str, data: bytes, folder: Path) -> None:
-    """A TUM folder, one of whose lists is these bytes."""
+    """A TUM folder with these bytes as one of its lists."""
     if not (folder / "depth").exists():
         write_png(folder / "depth/0.1.png", depth_image(1))
         (folder / "camera-intrinsics.txt").write_text("20 0 7.5\n0 21 5.5\n0 0 1\n")
@@ -663,7 +663,7 @@ def rigs(folder: Path) -> list[bytes]:
 
 
 def read_asl(name: str, data: bytes, folder: Path) -> None:
-    """A folder `mav0`, one of whose lists is these bytes."""
+    """A folder `mav0` with these bytes as one of its lists."""
     if not (folder / "mav0").exists():
         asl(folder)
     (folder / "mav0" / name).write_bytes(data)
@@ -671,13 +671,13 @@ def read_asl(name: str, data: bytes, folder: Path) -> None:
 
 
 def read_sensors(path: Path) -> None:
-    """Two sensor.yaml, the first of which is given."""
+    """Two sensor.yaml files, the first one given."""
     path.with_name("right.yaml").write_text(sensor_text(eyes().right, FORWARD @ eyes().T_left_right, "equidistant"))
     import_rig([path, path.with_name("right.yaml")])
 
 
 def read_two_view(data: bytes, folder: Path) -> None:
-    """A pair whose calib.txt is these bytes."""
+    """A pair with these bytes as calib.txt."""
     for name in ("im0.png", "im1.png"):
         write_png(folder / name, np.zeros((12, 16), np.uint8))
     (folder / "calib.txt").write_bytes(data)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Batches of random frames in a process of their own: one that dies or hangs is noted and replaced by another."""
+"""Batches of random frames in a separate process, which is recorded and replaced if it dies or hangs."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ from typing import Any
 from frames import BATCH, Tally, run, warm_up, without
 
 HUNG_S, STUCK_S = 60.0, 900.0
-"""Seconds of processor time, and by the clock, after which a call that has not come back never will.
+"""Seconds of processor time, and by the clock, after which a call counts as hung.
 
-By the clock alone, a call on a busy machine would count as one that hangs. A call that waits forever uses no processor
-time.
+By the clock alone, a call on a busy machine would count as hung. A call that waits forever uses no processor time.
 """
 MEMORY = 4 << 30
-"""Bytes that a batch may take."""
+"""Most memory of a batch in bytes."""
 NEVER = (float("inf"), float("inf"))
 LOOKS_S = 1.0
 PR_SET_PDEATHSIG = 1
 
 
 class Watched:
-    """Runs batches, one after the other, until there were enough frames or the time is over.
+    """Runs batches one after another until frames or time are used up.
 
-    memory: MB after the first batch and after the last, without what the allocator keeps for later: glibc gives arrays
-    of up to 32 MB out of its heap once some of that size were freed, and holes in it stay with the process.
+    memory: MB after the first batch and after the last, without the allocator's reserve: glibc allocates arrays of up
+    to 32 MB from its heap once some of that size were freed, and holes in it stay with the process.
     """
 
     def __init__(self, seed: int, words: Sequence[str], told: Callable[[str], None]):
@@ -45,14 +44,14 @@ class Watched:
         self._number, self._since = self._context.Value("q", 0), self._context.Array("d", 2)
 
     def run(self, frames: int, seconds: float) -> Tally:
-        """Return what was seen."""
+        """Return the results."""
         tally, batch, until = Tally(), 0, monotonic() + seconds
         while batch * BATCH < frames and monotonic() < until:
             batch = self._batches(tally, batch, frames, until)
         return tally
 
     def _batches(self, tally: Tally, batch: int, frames: int, until: float) -> int:
-        """Run batches in a new process for as long as it lives; return the number of the next one."""
+        """Run batches in a new process while it lives; return the number of the next one."""
         mine, theirs = self._context.Pipe()
         task = self._seed, self._words, batch, frames, until
         self._since[:] = NEVER  # until the first call
@@ -69,7 +68,7 @@ class Watched:
                     batch += 1
                 elif self._hangs(process.pid):
                     return self._lost(tally.hung, batch, f"no answer for {HUNG_S:.0f} s of work or {STUCK_S:.0f} s")
-        except EOFError:  # it is over, or it died
+        except EOFError:  # it ended or died
             process.join()
             if process.exitcode:
                 return self._lost(tally.bad, batch, f"the process ended with {process.exitcode}")
@@ -89,7 +88,7 @@ class Watched:
         return batch + 1
 
     def _tell(self, batch: int, seen: Tally, tally: Tally, megabytes: float) -> None:
-        """Say how it goes, and each thing that went wrong once."""
+        """Report progress, and each new failure once."""
         for line in seen.bad:
             what = line.partition(": ")[2]
             if what not in self._known:
@@ -105,7 +104,7 @@ class Watched:
 def _work(
     tell: Connection, number: Any, since: Any, seed: int, words: Sequence[str], batch: int, frames: int, until: float
 ) -> None:
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # else one that hangs would outlive its parent
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # else a hung process would outlive its parent
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     kinds, odd = without(words)
 

@@ -8,8 +8,8 @@
 A pole is in front of a wall, or of nothing, and a simulated camera sees it while it rests, flies or turns. `lost`:
 share of the layers of cells along the observed pole without an occupied cell that the pole touches. `free`: share of
 the cells that the pole touches and the map calls free. Truth is exact, a cylinder.
-The cases' own noise is independent from pixel to pixel; `--camera d435` uses a realistic camera
-in all of them (`stereovox.simulate.honest`).
+The cases' own noise is independent from pixel to pixel; `--camera d435` uses a realistic camera in all
+of them (`stereovox.simulate.honest`).
 
 `--random N` takes N random scenes, one for each seed from `--first-seed` on; with `--apart` half of them with
 the camera or the noise on which no setting was chosen. `--gaps` and `--poses` vary the gap behind the pole and the

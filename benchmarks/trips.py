@@ -5,14 +5,14 @@
 
 Without recordings, small generated ones: a 7-Scenes folder, a KITTI odometry sequence, a CARMEN log. Counted by
 running, with `sys.setprofile`, in a process that has made the trip before: modules are imported and kernels compiled.
-Two trips:
+The two trips:
 
     first   a new mapper is made and takes its first frame, which an open recording reads
     next    a mapper with WARM frames takes one more
 
-files: source files with an entered function, including kernels called from Python. lines: length of these
-files. moves: number of calls into another file than the previous call's. --house adds the figures of
-`benchmarks/house.py`. A later checkout is measured with `PYTHONPATH=OTHER/src`.
+files: source files with an entered function, including kernels called from Python. lines: length of these files.
+moves: number of calls into another file than the previous call's. --house adds the figures of `benchmarks/house.py`. A later checkout
+is measured with `PYTHONPATH=OTHER/src`.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ __all__ = ["Cruise", "explore"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names when they are first used, so that commands stay fast."""
+    """Import public names on first use, so that commands stay fast."""
     if name in _HOMES:
         return getattr(import_module(f"stereovox_lab.flights.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'stereovox_lab' has no attribute '{name}'")

@@ -142,7 +142,7 @@ def test_numbers_at_one_place_do_not_lie_on_each_other():
 def test_without_loops_it_says_so_and_shows_no_map():
     figure = loops_figure(closure_of(refused=[(0, 8)]), after_map(), before_map())
     assert "no loops were found" in figure.texts[1].get_text()
-    assert titles(figure) == ["The camera's way from above", ""]
+    assert titles(figure) == ["The camera's path from above", ""]
 
 
 def test_the_map_before_may_be_left_out():

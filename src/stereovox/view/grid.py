@@ -155,5 +155,5 @@ def legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
         states.insert(1, State.TENTATIVE)
     handles: list[Any] = [Patch(fc=STATE_COLOURS[state], ec="#888", label=NAMES[state]) for state in states]
     if with_track:
-        handles.append(Line2D([], [], color=PATH_COLOUR, label="the robot's way, from dot to square"))
+        handles.append(Line2D([], [], color=PATH_COLOUR, label="the robot's path, from dot to square"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=11, labelcolor=INK)

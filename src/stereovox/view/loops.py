@@ -102,14 +102,14 @@ def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> list[A
     """Draw both trajectories from above, and the loops; return the numbers of refused ones."""
     axis.set_aspect("equal", adjustable="datalim")
     axis.grid(alpha=0.25)
-    title(axis, "The camera's way from above")
+    title(axis, "The camera's path from above")
     _draw_way(axis, closure.T_world_before, across, BEFORE, "way before")
     _draw_way(axis, closure.T_world_sensor, across, AFTER, "way after")
     closed = closure.ends(closure.loops, closure.T_world_before)
     _draw_lines(axis, closed, across, CLOSED, label=f"{len(closed):,} loops closed: one place, seen again")
     refused = closure.ends(closure.refused, closure.T_world_sensor)  # like their coordinates below
     if len(refused):
-        _draw_lines(axis, refused, across, REFUSED, "--", f"{len(refused):,} refused: look alike, not believed")
+        _draw_lines(axis, refused, across, REFUSED, "--", f"{len(refused):,} refused: look alike")
     marks = [_draw_number(axis, ends[1][list(across)], number) for number, ends in enumerate(refused[:LISTED], 1)]
     measured(axis, ("xyz"[across[0]], "xyz"[across[1]], ""))
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=10.5, labelcolor=INK)
@@ -220,7 +220,7 @@ def _reasons(closure: LoopClosure) -> list[str]:
     """Return how to read the picture, and a line for each refused loop that is numbered."""
     lines = [
         "Map from above: dark where columns are full (walls), white where free, grey where not seen. "
-        "Dots are where the way begins, squares where it ends."
+        "Dots mark where the path begins, squares where it ends."
     ]
     for number, loop in enumerate(closure.summary()["loops_refused"][:LISTED], 1):
         lines.append(f"{number}   refused: {_place(loop['at'])} like {_place(loop['like'])}: {loop['why']}")

@@ -74,7 +74,7 @@ def draw_path(
     _room(along, voxel_map, places, radius, length)
     if blocked_at is not None:
         _mark(above, (aside, along), point_along(waypoints, blocked_at)[[*UPS[up][:2]]], blocked_at)
-    caption = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
+    caption = f"from above: cells {band[0]:.2f} to {band[1]:.2f} m high ({up}); the path may pass over or under them"
     above.set_title(caption, fontsize=11, color=INK)
     legend(figure, plan_grid.states, with_track=True)
     facts = [f"{length:.2f} m long", f"radius {radius:g} m", f"cells of {voxel_map.voxel_size:g} m"]

@@ -69,7 +69,7 @@ def score_figure(score: TrajectoryScore) -> Any:
     at, unit = _along(score)
     charts["height"].plot(at, true[:, up], color=TRUTH)
     _in_pieces(charts["height"], np.column_stack([at, found[:, up]]), lost, color=ESTIMATE)
-    caption(charts["height"], f"{AXES[up]} along the way", "Along the axis on which the truth spreads least.")
+    caption(charts["height"], f"{AXES[up]} along the path", "Along the axis on which the truth spreads least.")
     labels(charts["height"], unit, f"{AXES[up]} [m]")
     _errors(charts["errors"], at, score, lost)
     labels(charts["errors"], unit, "position error [m]")
@@ -104,7 +104,7 @@ def way_figure(positions: NDArray[np.float64], tracked: NDArray[np.bool_], headi
     ends = (
         "" if tracked[-1] else f" The last {len(tracked) - 1 - int(np.flatnonzero(tracked)[-1])} frames have no pose."
     )
-    caption(charts["height"], "Height along the way", (f"Red: {NO_POSE}." if spans else "") + ends)
+    caption(charts["height"], "Height along the path", (f"Red: {NO_POSE}." if spans else "") + ends)
     labels(charts["height"], "metres travelled", "z [m]")
     return figure
 
@@ -200,7 +200,7 @@ def _errors(axis: Any, at: NDArray[np.float64], score: TrajectoryScore, lost: Sp
     labels(turns, "", "rotation error [deg]")
     text = f"Blue: position, dashed its rmse (ATE, {score.position_m.rmse:.3g} m). Orange: rotation."
     text += f" Red: {NO_POSE} for longer than {MAX_GAP_INTERVALS:g} of the usual intervals." if lost else ""
-    caption(axis, f"Errors along the way, {'aligned' if score.aligned else 'as they stand'}", text)
+    caption(axis, f"Errors along the path, {'aligned' if score.aligned else 'as they stand'}", text)
 
 
 def _by_length(charts: dict[str, Any], segments: Sequence[SegmentErrors]) -> None:

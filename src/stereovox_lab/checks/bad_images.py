@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corrupt good frames in many ways: which of them does a mapper refuse, and what effect have the others?"""
+"""Corrupt good frames in many ways: which does a mapper refuse, and what effect do the others have?"""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, SIDE
 
 HARMLESS = 1e-3
-"""Share of sure cells, of those a frame says something of, whose state a frame without effect may change."""
+"""Share of certain cells with evidence whose state a harmless frame may change."""
 SURE = 2.0
-"""Log-odds of a sure cell, positive or negative."""
+"""Absolute log-odds of a certain cell."""
 WARM = 10
 """Good frames before the first bad one."""
 SHIFT_M, TURN_DEG = 0.2, 5.0
 SIDES = (("right", "left"), ("down", "up"), ("forward", "back"))
-"""Along the axes of the optical frame, x, y and z, and against them."""
+"""Names of both directions along the optical frame's axes x, y and z."""
 
 
 class Verdict(NamedTuple):
     """Outcome of a bad frame.
 
-    refused: why it was ("": it was not). changed: share of sure cells, of those it says something of, whose state it
-    would change otherwise than the true frame; freed: occupied cells that it would make free, and the true one not.
+    refused: the reason ("" if accepted). changed: share of certain cells with evidence whose state it would change
+    differently from the true frame; freed: occupied cells that it, but not the true frame, would free.
     """
 
     refused: str
@@ -47,12 +47,12 @@ class Verdict(NamedTuple):
 
     @property
     def harmless(self) -> bool:
-        """Whether it was not refused, and is without effect."""
+        """Whether it was accepted, and has no effect."""
         return not self.refused and self.changed < HARMLESS and self.freed == 0
 
 
 class Trial:
-    """A mapper in its parts, to which frames can be offered without being taken. settings: those of a mapper."""
+    """A mapper in its parts, to which frames can be offered without being added. settings: of the mapper."""
 
     def __init__(self, **settings: Any):
         self.config = load_config(**settings)
@@ -61,7 +61,7 @@ class Trial:
         self._comparison = Comparison(self.config, self._gate)
 
     def add(self, frame: AnyFrame) -> str:
-        """Take a frame into the map; return why it was refused, or ""."""
+        """Add a frame to the map; return why it was refused, or ""."""
         try:
             image, evidence, passed = self._offer(frame)
         except FrameRefused as refused:
@@ -73,7 +73,7 @@ class Trial:
         return ""
 
     def judge(self, bad: AnyFrame, true: AnyFrame) -> Verdict:
-        """Return what a bad frame would do in place of the true one, and leave all as it was."""
+        """Return the effect of a bad frame instead of the true one, and leave all unchanged."""
         history = self.map.history
         doubts, waiting = dict(history.doubts), dict(history.waiting)
         try:
@@ -106,14 +106,14 @@ class Trial:
         return Verdict("", float(changed.sum() / max(sure.sum(), 1)), int(freed.sum()))
 
     def _with(self, evidence: Evidence) -> VoxelMap:
-        """Return a copy of the map that took in `evidence`."""
+        """Return a copy of the map with `evidence` added."""
         copy = self.map.snapshot()
         copy.add(evidence)
         return copy
 
 
 def trial(source: Iterable[AnyFrame], every: int, seed: int = 0, **settings: Any) -> dict[str, Any]:
-    """Map the frames of `source`, and before every N-th of them offer each kind of bad frame in its place.
+    """Map the frames of `source`, and before every N-th of them offer each kind of bad frame instead.
 
     every: 0 for none. Returns `frames`, `refused` {reason: n} of the good ones, and `bad` {kind: `summary`}.
     """
@@ -124,7 +124,7 @@ def trial(source: Iterable[AnyFrame], every: int, seed: int = 0, **settings: Any
     for frame in source:
         frames += 1
         if every and frames > WARM and frames % every == 0 and before is not None and not frame.fault:
-            with suppress(FrameRefused):  # the good frame is refused itself
+            with suppress(FrameRefused):  # the good frame itself is refused
                 matched = tried.quality.depth.matched(frame)
                 for kind, bad in bad_frames(frame, matched, before, random):
                     verdicts.setdefault(kind, []).append(tried.judge(bad, frame))
@@ -139,7 +139,7 @@ def trial(source: Iterable[AnyFrame], every: int, seed: int = 0, **settings: Any
 
 
 def summary(found: list[Verdict]) -> dict[str, Any]:
-    """Return how many verdicts there are, and the shares of frames that were refused, harmless, and neither."""
+    """Return the number of verdicts, and the shares of refused, harmless and other frames."""
     passed = [one for one in found if not one.refused]
     refused, harmless = 1 - len(passed) / len(found), sum(one.harmless for one in passed) / len(found)
     return {
@@ -155,7 +155,7 @@ def summary(found: list[Verdict]) -> dict[str, Any]:
 def bad_frames(
     frame: AnyFrame, matched: Frame, before: AnyFrame, random: np.random.Generator
 ) -> Iterator[tuple[str, AnyFrame]]:
-    """Yield each kind of bad frame in place of `frame`; matched: it as depth image; before: the frame before it."""
+    """Yield each kind of bad frame for `frame`; matched: its depth image; before: the frame before it."""
     yield from _bad_depths(matched, random)
     if isinstance(frame, StereoFrame):
         yield from _bad_pairs(frame, random)
@@ -178,7 +178,7 @@ def displaced(frame: Any, shift_m: NDArray[np.float64], turn_rad: NDArray[np.flo
 
 
 def metres(frame: Frame) -> NDArray[np.float32]:
-    """Return the depths (height, width) of a frame in metres, 0 for none."""
+    """Return the depths (height, width) of a frame in metres, 0 if none."""
     depth = frame.depth.astype(np.float32) * np.float32(frame.depth_scale)
     none = ~(np.isfinite(depth) & (depth > 0))
     if frame.depth.dtype == np.uint16:
@@ -231,7 +231,7 @@ def _turned(frame: Frame, turn: Callable[[NDArray[Any]], NDArray[Any]]) -> Frame
 
 
 def _kept(evidence: Evidence) -> Evidence:
-    """Return evidence that stays when more is made."""
+    """Return evidence that survives the next integration."""
     return Evidence(
         evidence.coords.copy(), evidence.values.copy(), evidence.uniform.copy(), evidence.uniform_values.copy()
     )

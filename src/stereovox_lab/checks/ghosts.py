@@ -19,23 +19,23 @@ from stereovox.maps import State
 from stereovox_lab.checks.passer_by import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, PasserBy
 
 GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
-"""States in which a cell is no obstacle any more."""
+"""States in which a cell is no longer an obstacle."""
 NOISE = 0.3
-"""Metres about the person in which cells are followed: six standard deviations of the depth."""
+"""Metres around the person in which cells are followed: six standard deviations of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClearTimes:
     """Frames until cells that had been wrongly occupied were clear.
 
-    frames: (N,) float64, 1 where the first frame that saw the cell free cleared it, inf where it never was cleared,
-    NaN where the cell was not occupied when it was first seen free, or never seen free.
+    frames: (N,) float64, 1 if the first frame that saw the cell free cleared it, inf if it was never cleared,
+    NaN if the cell was not occupied when first seen free, or never seen free.
     """
 
     frames: NDArray[np.float64]
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """Return cells asked, share of them that was cleared, median, 90th percentile and longest time of those."""
+        """Return the number of cells, the share cleared, and median, 90th percentile and longest time of these."""
         asked = self.frames[~np.isnan(self.frames)]
         cleared = asked[np.isfinite(asked)]
         values = np.percentile(cleared, [50, 90, 100]).tolist() if len(cleared) else [None] * 3
@@ -46,12 +46,12 @@ class ClearTimes:
 def time_to_clear(
     states: ArrayLike, seen_free: ArrayLike, clear: Sequence[State] = (State.FREE,), before: ArrayLike | None = None
 ) -> ClearTimes:
-    """Count for each truly free cell the frames from when it is first seen free until the map says so.
+    """Count, for each truly free cell, the frames from when it is first seen free until it is free in the map.
 
     states: (F, N) `State` of each of N cells after each of F frames; seen_free: (F, N) whether that frame really sees
     through the cell. before: (N,) states before the first frame, by default unknown. The clock starts at the first
     frame that sees the cell free while the map, before that frame, calls it occupied, and stops at the first frame
-    after which its state is one of `clear`; frames that do not see the cell count as well. Give only cells that stay
+    after which its state is one of `clear`; frames that do not see the cell count too. Give only cells that stay
     free from then on. Raises StereovoxError if the arrays do not fit together.
     """
     after, seen = np.asarray(states), np.asarray(seen_free, bool)
@@ -66,7 +66,7 @@ def time_to_clear(
 
 
 def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return for each column of (F, N) the first row that is true, inf if none is."""
+    """Return, for each column of (F, N), the first true row, inf if there is none."""
     if not len(flags):
         return np.full(flags.shape[1], np.inf)
     return np.where(flags.any(axis=0), flags.argmax(axis=0), np.inf)
@@ -74,17 +74,17 @@ def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Ghosts:
-    """Outcome for the cells where a person had been, and for static objects.
+    """Outcome for the cells where a person was, and for static objects.
 
-    number: (F,) ghosts after each frame: cells that are occupied though the frame truly sees through them.
+    number: (F,) ghosts after each frame: occupied cells that the frame truly sees through.
     gone: frames until a cell that is seen free was no longer occupied; free: until it was free.
-    left: cells still occupied in the last frame; unseen: those of them that no frame ever saw free.
-    after_leaving: frames, from the first that does not show the person, until no cell that was seen is a ghost; inf:
+    left: cells still occupied in the last frame; unseen: the ones of them that no frame ever saw free.
+    after_leaving: frames, from the first that does not show the person, until no seen cell is a ghost; inf:
         never.
-    pole_lost: of the layers of cells in which the pole was found in the first second, the share in which, later, it has
+    pole_lost: of the layers of cells in which the pole was found in the first second, the share in which it later has
         no occupied cell; mean over all frames. 1 if it was not found at all.
-    pole_free: the same for single cells that had been occupied and are free; the pole may only have grazed them.
-    static_lost: share of the wall's and floor's cells, occupied before the person came, that were not so at the end.
+    pole_free: the same for single cells that were occupied and are free; the pole may only have grazed them.
+    static_lost: share of the wall's and floor's cells, occupied before the person came, that were not at the end.
     """
 
     number: NDArray[np.int64]
@@ -119,9 +119,9 @@ class Ghosts:
 
 
 def ghosts(source: PasserBy, frames: list[Frame] | None = None, **settings: Any) -> Ghosts:
-    """Map the frames of `source` and follow all cells where the person passes, and those of the pole.
+    """Map the frames of `source` and follow all cells where the person passes, and the pole's.
 
-    frames: those of the source, where several maps are made of the same ones. settings: of the mapper.
+    frames: the source's, if several maps use the same ones. settings: of the mapper.
     """
     frames = frames or [source.frame(i) for i in range(len(source))]
     mapper = Mapper(**settings)
@@ -143,7 +143,7 @@ def ghosts(source: PasserBy, frames: list[Frame] | None = None, **settings: Any)
 def passed_cells(side: float) -> NDArray[np.int32]:
     """Return the indices (N, 3) of all cells with sides `side` where the person passes, or its noise may be."""
     deep, half = WIDE / 2 + NOISE, WALK_FROM + WIDE
-    low, high = (WALK_X - deep, -half, 2 * side), (WALK_X + deep, half, TALL + NOISE)  # the floor stays
+    low, high = (WALK_X - deep, -half, 2 * side), (WALK_X + deep, half, TALL + NOISE)  # keep the floor
     axes = [np.arange(np.floor(a / side), np.ceil(b / side)) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int32)
 
@@ -151,7 +151,7 @@ def passed_cells(side: float) -> NDArray[np.int32]:
 def seen_free(
     source: PasserBy, i: int, centers: NDArray[np.float64], side: float, max_range: float
 ) -> NDArray[np.bool_]:
-    """Tell which cells (N,) with sides `side` frame `i` truly sees through; the person must be a cell away."""
+    """Return which cells (N,) with sides `side` frame `i` truly sees through; the person must be a cell away."""
     camera = source.camera
     points = transform_points(inverse(source.T_world_camera), centers)
     z, half = points[:, 2], side * np.sqrt(3) / 2
@@ -193,7 +193,7 @@ def _judged(
 
 
 def _pole(states: NDArray[np.uint8], pole: NDArray[np.int32]) -> tuple[float, float]:
-    """Return what `Ghosts` tells of the pole for the states (F, N) of its cells (N, 3)."""
+    """Return the pole's figures of `Ghosts` from the states (F, N) of its cells (N, 3)."""
     occupied, layers = states == State.OCCUPIED, pole[:, 2]
     stands = np.stack([occupied[:, layers == layer].any(axis=1) for layer in np.unique(layers)], axis=1)
     found, once = stands[:BEFORE].any(axis=0), occupied[:BEFORE].any(axis=0)

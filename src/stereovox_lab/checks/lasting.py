@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults and changes of the world that last: which does a mapper take in, and how soon?
+"""Lasting faults and changes of the world: which does a mapper accept, and how soon?
 
-A camera, or a lidar, walks once round a hall at random (`sim:hall`) and maps it. On its second round either its images
-are bad for a number of seconds, or the world is another one.
+A camera, or a lidar, walks once round a random hall (`sim:hall`) and maps it. On its second round either its images are
+bad for a number of seconds, or the world has changed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from stereovox.simulate.scenes import hall
 from stereovox_lab.checks.bad_images import SURE, displaced
 
 HZ, MAP_HZ, LAP_S = 10, 5, 40.0
-"""Frames a second, those of the first round, and how long a round takes."""
+"""Frames a second, frames a second in the first round, and duration of a round."""
 IMAGE_WIDTH = 160
 RINGS, TURN = np.radians(np.linspace(-15, 15, 16)), np.radians(np.arange(0, 360, 2.0))
 """Elevations and azimuths of the lidar's beams."""
@@ -39,14 +39,14 @@ Depth = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """A hall, a way round it, and what a camera (or a lidar, `cloud`) sees on it. seed: plan of the hall, and noise."""
+    """A hall, a path round it, and what a camera (or a lidar, `cloud`) sees. seed: plan of the hall, and noise."""
 
     seed: int
     cloud: bool = False
 
     @cached_property
     def stage(self) -> Any:
-        """The hall and the way."""
+        """The hall and the path."""
         return hall.stage(plan=self.seed)
 
     @cached_property
@@ -56,12 +56,12 @@ class Walk:
         return D435(replace(depth_camera(IMAGE_WIDTH), subpixel=subpixel), subpixel)
 
     def frames(self, start_s: float, seconds: float, hz: float, world: Callable[[float], Scene]) -> list[Any]:
-        """Return frames from `start_s` on, taken of `world` at each time."""
+        """Return frames from `start_s` on, of `world` at each time."""
         times = start_s + np.arange(round(seconds * hz)) / hz
         return [self.frame(float(time), world(float(time))) for time in times]
 
     def frame(self, time_s: float, scene: Scene) -> Any:
-        """Return what is seen at one time of the walk."""
+        """Return the frame at one time of the walk."""
         T = self.stage.path(time_s / LAP_S % 1.0)
         number = round(time_s * 1000)
         if self.cloud:
@@ -89,7 +89,7 @@ Fault = Callable[[Any, int, "Bad"], Any]
 
 @dataclass(frozen=True, eq=False)
 class Bad:
-    """What faults need: good frames from the first one that is spoilt on, those of another place, random numbers."""
+    """Inputs of faults: good frames from the first spoilt one on, frames of another place, random numbers."""
 
     good: Sequence[Any]
     elsewhere: Sequence[Any]
@@ -120,7 +120,7 @@ def _where_seen(change: Callable[[Depth], Depth]) -> Fault:
 
 
 def _blocks(depth: Depth, random: np.random.Generator) -> Depth:
-    """Put eight blocks at random, each at a random depth, that cover about a third of the view."""
+    """Add eight random blocks at random depths, covering about a third of the view."""
     depth = depth.copy()
     h, w = depth.shape
     for _ in range(8):
@@ -190,11 +190,11 @@ FAULTS: dict[str, Fault] = {
     "half at 0.5 m": _depth(_half_near),
     "knocked camera": _knocked,
 }
-"""Faults of one frame: what it becomes, by its number since the fault began."""
+"""Faults of one frame, given its number since the fault began."""
 
 
 def _changed(kind: str, seed: int) -> Callable[[float], Scene]:
-    """Return the world of a kind at a time in seconds."""
+    """Return a function from time in seconds to the changed world of a kind."""
     stage, random = hall.stage(plan=seed), np.random.default_rng([31, seed])
     solids, start = stage.build().solids, LAP_S
 
@@ -264,11 +264,11 @@ CHANGES = (
 
 @dataclass(frozen=True)
 class Lasted:
-    """What became of a fault: frames accepted, and cells that are wrong, after each number of seconds.
+    """The effect of a fault: accepted frames, and wrong cells, after each number of seconds.
 
-    sure: surely occupied cells before it. accepted, freed, changed: by seconds: frames that were accepted; surely
-    occupied cells that are free, and surely known cells whose state is another, which with good frames are not.
-    reasons: of refusals. late: good frames refused after it.
+    sure: certainly occupied cells before it. accepted, freed, changed: by seconds: accepted frames; certainly occupied
+    cells now free, and certainly known cells in another state, beyond the changes by good frames. reasons: of refusals.
+    late: good frames refused after it.
     """
 
     sure: int
@@ -280,7 +280,7 @@ class Lasted:
 
 
 class Trial:
-    """One hall, mapped on a first round; faults and changes begin from that map. settings: those of the mapper."""
+    """One hall, mapped on a first round; faults and changes start from that map. settings: of the mapper."""
 
     def __init__(self, seed: int, cloud: bool = False, **settings: Any):
         self.walk, self.settings = Walk(seed, cloud), {"voxel_size": 0.1, "max_range": 5.0, **settings}
@@ -295,12 +295,12 @@ class Trial:
         self.points, self.before = points[sure], mapper.map.state(points[sure])
 
     def mapper(self, **settings: Any) -> Mapper:
-        """Return a mapper that goes on with the map of the first round."""
+        """Return a mapper that continues the map of the first round."""
         return Mapper(**{**self.settings, **settings}, resume=load_map(Path(self._folder.name) / "map"))
 
     @cached_property
     def good(self) -> list[Any]:
-        """Good frames of the second round, one second and all that a fault of 20 s and the time after it need."""
+        """Good frames of the second round: one second, and enough for a fault of 20 s and the time after it."""
         return self.walk.frames(LAP_S, 24, HZ, self._hall)
 
     @cached_property
@@ -309,7 +309,7 @@ class Trial:
         return self.walk.frames(1.5 * LAP_S, 24, HZ, self._hall)
 
     def fault(self, kind: str, seconds: Sequence[float] = (1, 4, 20)) -> Lasted:
-        """Return what becomes of a fault that lasts the longest of `seconds`, and of two good seconds after it."""
+        """Return the effect of a fault that lasts the longest of `seconds`, and of two good seconds after it."""
         first, last = HZ, HZ + round(max(seconds) * HZ)
         bad = Bad(self.good[first:], self.elsewhere, np.random.default_rng([self.walk.seed, 7]))
         mapper, control = self.mapper(), self.mapper()
@@ -331,11 +331,11 @@ class Trial:
         return Lasted(int((self.before == State.OCCUPIED).sum()), accepted, freed, changed, dict(reasons), late)
 
     def change(self, kind: str, seconds: float = LAP_S) -> dict[str, Any]:
-        """Return what becomes of a world that is another one on the second round.
+        """Return the effect of a world that has changed on the second round.
 
-        refused: frames, by reason; longest_s: of refusals without an accepted frame between them; taken: share of the
-        cells that a mapper without the comparison changes from free to occupied or back which are so in this map;
-        wrong: how many of them are free although they are occupied.
+        refused: frames, by reason; longest_s: of refusals without an accepted frame between; taken: of the cells that a
+        mapper without the comparison changes between free and occupied, the number changed in this map; wrong: the
+        number of these that are free although occupied.
         """
         mapper, control = self.mapper(), self.mapper(**{"trust.max_disagreement": 1})
         refused: list[str | None] = []
@@ -357,7 +357,7 @@ class Trial:
     def _second_round(self, kind: str, seconds: float) -> list[Any]:
         if kind != "other building":
             return self.walk.frames(LAP_S, seconds, HZ, _changed(kind, self.walk.seed))
-        other = Walk(self.walk.seed + 1000, self.walk.cloud)  # its poses go on from where the camera was
+        other = Walk(self.walk.seed + 1000, self.walk.cloud)  # its poses continue from the camera's last one
         frames = other.frames(LAP_S, seconds, HZ, _always(other.stage.build()))
         begin = self.walk.frame(LAP_S, self._hall(0)).T_world_sensor @ np.linalg.inv(frames[0].T_world_sensor)
         return [replace(frame, T_world_sensor=begin @ frame.T_world_sensor) for frame in frames]

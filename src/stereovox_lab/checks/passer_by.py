@@ -20,11 +20,11 @@ HZ = 30
 BACKGROUNDS = ("near", "far", "silent")
 MISSES = ("background", "unmatched")
 HEIGHT = 1.2
-"""Of the camera above the floor."""
+"""Height of the camera above the floor."""
 WALK_X, WALK_FROM, SPEED_MPS = 2.5, 3.2, 1.5
-"""Where the person walks: so far before the camera, from so far left to so far right."""
+"""The person's path: distance from the camera, and extent to the left and right."""
 WIDE, TALL = 0.45, 1.75
-"""Of the person."""
+"""Width and height of the person."""
 WALL = 4.0
 POLE = (1.5, -0.47)
 BEFORE, AFTER = 30, 45
@@ -35,8 +35,8 @@ class PasserBy(DepthSource):
     """Frames of a simulated D435, 30 a second: empty, a person walking from left to right, empty. World: z up, metres.
 
     background: `near`, a wall within range; `far`: nothing behind the person but the floor, and the camera reports it
-    as too far away; `silent`: the same, but the camera does not say why it has no value. pole_m: thickness of the pole.
-    pole_every: it is measured in one frame of this many; `missed` says how the others miss it: its pixels show the
+    as too far away; `silent`: the same, but without a reason for the missing value. pole_m: thickness of the pole.
+    pole_every: it is measured in one frame of this many; `missed`: how the others miss it: its pixels show the
     background (`background`) or have no value (`unmatched`). Raises SourceError for unknown words.
     """
 
@@ -68,7 +68,7 @@ class PasserBy(DepthSource):
 
     @cached_property
     def static(self) -> Scene:
-        """What does not move: floor, pole, and the wall if there is one."""
+        """The static parts: floor, pole, and the wall if there is one."""
         return Scene([*self._surroundings, self.pole])
 
     @cached_property
@@ -86,7 +86,7 @@ class PasserBy(DepthSource):
 
     @lru_cache(maxsize=1)  # noqa: B019 - one image, asked for again at once
     def true_depth(self, i: int) -> NDArray[np.float32]:
-        """Return the exact depth (height, width) in metres of frame `i`, inf if nothing is."""
+        """Return the exact depth (height, width) in metres of frame `i`, inf if there is nothing."""
         return self._cast(self.person(i), pole=True)
 
     def shows_person(self, i: int) -> bool:
@@ -94,7 +94,7 @@ class PasserBy(DepthSource):
         return self.person(i) is not None and bool((self.true_depth(i) < self._cast(None, pole=True)).any())
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; raises IndexError for one that does not exist."""
+        """Return frame `i`; raises IndexError if it does not exist."""
         i = range(len(self))[i]
         shown = i % self.pole_every == 0
         truth = self._cast(self.person(i), pole=shown or self.missed == "unmatched")

@@ -16,10 +16,10 @@ from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.simulate.scene import Scene
 
 CLOSE = 0.03
-"""Share of the true distance by which a range may be off."""
+"""Largest error of a range, as a share of the true distance."""
 SIGMAS = 2.0
 SLACK = 1e-3
-"""Share of a distance by which a surface may seem nearer than itself: rays are float32."""
+"""Share of a distance by which a surface may seem nearer: rays are float32."""
 
 
 def nearest_surfaces(
@@ -27,7 +27,7 @@ def nearest_surfaces(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the true range of the nearest and of the farthest surface in each cell (azimuths, polars), metres.
 
-    By rays * rays rays from the body's origin, even in both angles. Infinite if nothing is.
+    From rays * rays rays from the body's origin, uniform in both angles. Infinite if there is nothing.
     """
     offsets = ((np.arange(rays) + 0.5) / rays - 0.5) * layout.step
     theta = (layout.polar()[:, None] + offsets).reshape(1, -1)
@@ -42,7 +42,7 @@ def nearest_surfaces(
 def seen_cells(
     scene: Scene, pairs: Sequence[StereoPair], T_world_body: Transform, layout: SphereLayout
 ) -> NDArray[np.bool_]:
-    """Tell which cells (azimuths, polars) hold, at their middle, a surface that both eyes of some pair see."""
+    """Return which cells (azimuths, polars) have, at their middle, a surface seen by both eyes of some pair."""
     rays = layout.directions().reshape(-1, 3)
     ranges = scene.cast(T_world_body[:3, 3], rays @ T_world_body[:3, :3].T)
     there = np.isfinite(ranges)
@@ -56,7 +56,7 @@ def seen_cells(
 def range_sigma(
     pair: StereoPair, layout: SphereLayout, range_m: NDArray[np.floating], disparity_sigma: float
 ) -> NDArray[np.float64]:
-    """Return the standard deviation (azimuths, polars) in metres of ranges that a pair measures; NaN if it cannot.
+    """Return the standard deviation (azimuths, polars) in metres of a pair's ranges; NaN if it has none.
 
     From Valenti 2018, Eq 4.2 and 4.7, along the ray from the pair's left eye. disparity_sigma: pixels.
     """
@@ -80,13 +80,12 @@ def range_sigma(
 def sphere_score(
     grid: SphereGrid, nearest: NDArray[np.floating], seen: NDArray[np.bool_], sigma: NDArray[np.floating]
 ) -> dict[str, float]:
-    """Return how a grid compares with the truth in the directions that were seen, as shares of 0 to 1.
+    """Compare a grid with the truth in the directions seen, as shares from 0 to 1.
 
-    nearest, seen, sigma: (azimuths, polars), the true range of the nearest surface of each cell, where a stereo camera
-    sees it, and the standard deviation of a range in metres. Solid angles do not count: each cell does.
-    known: of the seen directions, how many have a range. close: how many of these are within 3 % of the truth;
-    close_of_seen: of all seen ones. over: how many ranges are more than 2 sigma beyond the nearest surface. median:
-    of range / truth - 1.
+    nearest, seen, sigma: (azimuths, polars), true range of the nearest surface of each cell, whether a stereo camera
+    sees it, and standard deviation of a range in metres. Each cell counts alike, regardless of its solid angle. known:
+    share of the seen directions with a range. close: share of these within 3 % of the truth; close_of_seen: of all seen
+    ones. over: share of ranges more than 2 sigma beyond the nearest surface. median: of range / truth - 1.
     """
     known = seen & (grid.reason == Reason.VALID)
     found, truth = grid.range_m[known].astype(float), nearest[known].astype(float)

@@ -44,7 +44,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--peers",
         metavar="A,B",
         help="other libraries: octomap, pyoctomap, wavemap, octomap-rays; in C++, once built: octomap-cpp, bonxai, "
-        "ufomap, wavemap-cpp; or a class of yours, module:Class (default: the first three, where installed)",
+        "ufomap, wavemap-cpp; or a class of yours, module:Class (default: the first three, if installed)",
     )
     parser.add_argument(
         "--integrators",
@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="integrators of stereovox: projective, ray, line (%(default)s)",
     )
     parser.add_argument("--threads", type=int, metavar="N", help="threads of stereovox (both 1 and all cores)")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used (5)")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth used, in metres (5)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument(
         "--far",
@@ -102,7 +102,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> None:
-    """Run all requested measurements, and pass on each result as soon as it is there."""
+    """Run all requested measurements, and pass on each result as soon as it is ready."""
     from stereovox.opening import open_source
     from stereovox_lab.bench.frames import read_frames
     from stereovox_lab.bench.more import MEASUREMENTS, Given, check_names
@@ -177,13 +177,13 @@ def _limits(arguments: Namespace, measurements: Sequence[str]) -> dict[str, int]
 
 
 def _peers(text: str | None) -> tuple[list[str], list[str]]:
-    """Return the peers to compare with, and a line for each usual one that is not installed."""
+    """Return the peers to compare with, and a line for each default one that is not installed."""
     from stereovox_lab.bench.peers import installed
 
     if text is None:
         return installed()
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where a user's module:Class lies, as for `python -m`
+        sys.path.append(os.getcwd())  # a user's module:Class is here, as for `python -m`
     return _named(text), []
 
 

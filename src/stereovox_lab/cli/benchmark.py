@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare how accurate the maps of several libraries are, by a fixed protocol (how fast they are: `bench`).
 
-DATASET is a recording, by its folder, or a simulation; without one simulations with cameras that err as real ones do.
-The truth is exact geometry for a simulation, the lidar where a recording has one, otherwise frames that are held out.
+DATASET is a recording, by its folder, or a simulation; by default simulations with realistic cameras.
+The truth is exact geometry for a simulation, the lidar if a recording has one, otherwise held-out frames.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--libraries",
         metavar="A,B",
         help="stereovox, stereovox:PROFILE, octomap, octomap-rays, pyoctomap, wavemap, or a class of yours, "
-        "module:Class (default: stereovox, octomap, pyoctomap and wavemap, where installed)",
+        "module:Class (default: stereovox, octomap, pyoctomap and wavemap, if installed)",
     )
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres (0.05; with a lidar 0.2)")
     parser.add_argument("--max-range", type=float, metavar="M", help="distance that is mapped (5; with a lidar 20)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames of each recording, as a Python slice")
     parser.add_argument(
-        "--most-frames", type=int, default=100, metavar="N", help="frames that are used, evenly chosen (%(default)s)"
+        "--most-frames", type=int, default=100, metavar="N", help="frames used, evenly chosen (%(default)s)"
     )
     parser.add_argument(
         "--seed", type=int, action="append", metavar="N", help="of simulated noise; repeatable (7001, 7002 and 7003)"
@@ -50,7 +50,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     folder = out_folder(arguments.out) if arguments.out is not None else None
     libraries = None if arguments.libraries is None else _named(arguments.libraries)
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where a user's module:Class lies, as for `python -m`
+        sys.path.append(os.getcwd())  # a user's module:Class is here, as for `python -m`
     say_about_compiling()
 
     def so_far(result: dict[str, Any]) -> None:

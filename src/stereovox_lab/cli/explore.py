@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly missions in simulations: a quadrotor explores, or finds the middle of a room, by the map it makes.
 
-Nobody steers. The report tells collisions, coverage over time, and every flight.
+The flights are autonomous. The report lists collisions, coverage over time, and every flight.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ stereovox explore sim:room --mission middle --seeds 0:3 --out middle"""
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "scenes", metavar="SCENE", nargs="*", help="simulation; {seed} stands for the seed (sim:hall?plan={seed})"
+        "scenes", metavar="SCENE", nargs="*", help="simulation; {seed} is replaced by the seed (sim:hall?plan={seed})"
     )
     parser.add_argument(
         "--mission",
         choices=("frontiers", "middle"),
         default="frontiers",
-        help="explore until no frontier can be reached, or find the middle of the room and look round (%(default)s)",
+        help="explore until no frontier can be reached, or find the middle of the room and look around (%(default)s)",
     )
     parser.add_argument("--seeds", default="0:5", metavar="A:B", help="starts, each flown in each scene (%(default)s)")
     parser.add_argument("--seconds", type=float, default=300.0, metavar="S", help="longest flight (%(default)s)")
-    parser.add_argument("--speed", type=float, default=0.6, metavar="M/S", help="along ways, m/s (%(default)s)")
+    parser.add_argument("--speed", type=float, default=0.6, metavar="M/S", help="along paths, m/s (%(default)s)")
     parser.add_argument("--voxel-size", type=float, default=0.1, metavar="M", help="cell size in metres (%(default)s)")
     parser.add_argument(
         "--margin",
         type=float,
         default=0.1,
         metavar="M",
-        help="metres between the propellers and what is not known to be free (%(default)s)",
+        help="metres between the propellers and cells not known to be free (%(default)s)",
     )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="flights at a time (%(default)s)")
     parser.add_argument(

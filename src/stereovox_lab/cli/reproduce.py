@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reproduce the experiments of a paper: one report with its figures next to ours.
 
-All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
+All of Chien 2020 is simulated and takes some minutes. --data also maps your own recording under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
-Thresholds are chosen on other drives than they are scored on, of a single drive on the first half of its street.
-IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is a bag of your own instead.
-A reference map that SLAM's self-check doubts is named, with exit status 3, and no claim holds that stands on it.
+Thresholds are never chosen and scored on the same drive; a single drive is split into two halves of its street.
+IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is your own bag instead.
+A reference map that SLAM's self-check doubts is reported, with exit status 3, and no claim based on it holds.
 """
 
 from __future__ import annotations

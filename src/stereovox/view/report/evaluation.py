@@ -34,7 +34,7 @@ HEADS = {
     "ece_equal_mass": "ece, equal mass",
 }
 DECIDED = (
-    "Free means that a robot may drive there. So the error that kills is a surface called free; worse, with nothing "
+    "Free means that a robot may drive there. So the fatal error is a surface called free; worse, with nothing "
     "tentative or occupied next to it. A robot stops for what is occupied, and often for what is tentative or unknown. "
     "The map decides by its own thresholds; only cells count that the truth knows."
 )
@@ -76,10 +76,10 @@ WHERE = (
 )
 FRAMES = (
     "As in Valenti 2018, Fig 8.4: the map after each frame against the truth of the whole recording. Recall and "
-    "correlation rise while new parts come into view; precision and error tell about what is mapped already."
+    "correlation rise while new parts come into view; precision and error describe the part already mapped."
 )
 CURVES = (
-    "How careful should a map be before it calls a cell occupied, and can its probabilities be believed? Dotted lines "
+    "How careful should a map be before it calls a cell occupied, and can its probabilities be trusted? Dotted lines "
     "are exact, full lines forgive errors within the tolerance. Cells never observed are never called occupied; in the "
     "ROC they stand at p = 0.5."
 )
@@ -163,7 +163,7 @@ def _tables(results: Sequence[Evaluated]) -> Iterable[str]:
     )
     yield page.section(
         "Observed cells only",
-        "The same without the cells the map has never observed: how good is what it does say?",
+        "The same without the cells the map has never observed: how good are its statements?",
         page.table(["map", *heads], ([one.name, *_observed_row(one.scores)] for one in results)),
     )
     yield page.section(
@@ -174,7 +174,7 @@ def _tables(results: Sequence[Evaluated]) -> Iterable[str]:
     )
     yield page.section(
         "As probabilities",
-        "Without a threshold: does the map order cells rightly, and can its probabilities be believed?",
+        "Without a threshold: does the map order cells rightly, and can its probabilities be trusted?",
         _table_of(AS_PROBABILITIES, results),
     )
 

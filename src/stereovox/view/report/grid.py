@@ -15,7 +15,7 @@ from stereovox.view.report import page
 
 LEAD = (
     "{} compared with {}, cell by cell, in cells of {:g} m of the reference. The error of IST 2019, Eq 7, counts every "
-    "cell that differs: what only one of the two maps knows (coverage), and what they call by opposite states "
+    "cell that differs: cells known to only one map (coverage), and cells with opposite states "
     "(contradiction). A wall that stands one cell aside counts twice; the other measures tell it from a wrong one."
 )
 KINDS = {
@@ -29,7 +29,7 @@ ALL = "Every cell the reference knows; one that the map does not know is not cal
 OBSERVED = "Cells known to both maps"
 TALLY = ("cells", "tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "correlation")
 DIFFERENCE = (
-    "Light and dark grey are right. Where one pixel stands for several cells it shows a wrong wall before all else. "
+    "Light and dark grey are right. A pixel of several cells shows a wrong wall first. "
     "difference.png next to this page is the binary image with a pixel for each cell."
 )
 

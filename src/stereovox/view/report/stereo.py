@@ -114,7 +114,7 @@ def _lines(axis: Any, wide: NDArray[np.uint8], name: str) -> None:
     for row in np.linspace(0, wide.shape[0] - 1, ROWS + 2)[1:-1]:
         axis.axhline(row, color=ROW, linewidth=0.8)
     axis.set(xticks=[], yticks=[])
-    axis.set_xlabel("what stands on a line in one image stands on it in the other", color=GREY)
+    axis.set_xlabel("points on a line in one image are on it in the other", color=GREY)
     title(axis, f"{name}, rectified")
 
 

@@ -21,8 +21,8 @@ ERROR_HEADS = ("error", "pairs", *FIGURES, "unit")
 SEGMENT_HEADS = ("segments of", "number", "translation", "rotation")
 ERRORS = (
     "Positions and rotations (absolute trajectory error, ATE) are those of the poses themselves. Motions (relative "
-    "pose error, RPE) are compared from one pose to the next, and to the one a second later; where a trajectory "
-    "stands in its world does not matter for them."
+    "pose error, RPE) are compared from one pose to the next, and to the one a second later; a trajectory's "
+    "place in its world does not matter for them."
 )
 SEGMENTS = (
     "KITTI's rule: from every tenth pose to the first one that lies further along the true trajectory than the "

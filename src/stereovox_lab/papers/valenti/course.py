@@ -13,9 +13,9 @@ from stereovox_lab.papers.valenti.judge import Judged
 from stereovox_lab.papers.valenti.mappers import THESIS
 
 RISING, STEADY = ("recall", "correlation"), ("precision", "error")
-"""Measures that rise while the scene is explored, and those that stay about level, says 8.4."""
+"""Measures that rise while the scene is explored, and those that stay about level, according to 8.4."""
 RISES, LEVEL, FRAMES = 0.9, 0.05, 8
-"""Least rank correlation with the frame of what rises; most change of what stays level; least number of frames."""
+"""Least rank correlation of a rising measure with the frame; largest change of a level one; fewest frames."""
 
 
 def course_claims(judged: Sequence[Judged]) -> list[Claim]:
@@ -48,7 +48,7 @@ def _stays(one: Judged, name: str) -> Claim:
 
 
 def rank_correlation(values: NDArray[np.floating]) -> float:
-    """Return Spearman's rank correlation of values (N,) with their order; 0 where all are equal."""
+    """Return Spearman's rank correlation of values (N,) with their order; 0 if all are equal."""
     from scipy.stats import rankdata
 
     if np.ptp(values) == 0:
@@ -57,7 +57,7 @@ def rank_correlation(values: NDArray[np.floating]) -> float:
 
 
 def _values(one: Judged, name: str) -> NDArray[np.float64] | None:
-    """Return the measure after each frame in which it has a value; None if those are too few."""
+    """Return the measure after each frame in which it has a value; None if there are too few."""
     assert one.series is not None
     values = np.asarray(one.series.get(name, ()), float)
     values = values[np.isfinite(values)]

@@ -11,8 +11,8 @@ The two trips:
     next    a mapper with WARM frames takes one more
 
 files: source files with an entered function, including kernels called from Python. lines: length of these files.
-moves: number of calls into another file than the previous call's. --house adds the figures of `benchmarks/house.py`. A later checkout
-is measured with `PYTHONPATH=OTHER/src`.
+moves: number of calls into another file than the previous call's. --house adds the figures of
+`benchmarks/house.py`. A later checkout is measured with `PYTHONPATH=OTHER/src`.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, ma
 def test_too_few_positions_are_told_before_any_work(mapper, monkeypatch):
     monkeypatch.delattr(LoopCloser, "add")
     stamps_ns = np.array([frame.stamp_ns for frame in mapper.map.kept_frames.frames[:2]])
-    with pytest.raises(sv.StereovoxError, match="2 places of the way have a position"):
+    with pytest.raises(sv.StereovoxError, match="2 places of the path have a position"):
         close(mapper, positions=Positions(stamps_ns, np.zeros((2, 3)), 1.0))
 
 

@@ -90,7 +90,7 @@ def test_one_that_cannot_be_used_is_told_and_left(tmp_path):
 
 def test_forces_in_g_say_nothing_of_up(tmp_path):
     found = sv.track_recording(recorded(tmp_path / "walk.bag", force=1 / 9.81))
-    assert found.imu.endswith("its accelerometer did not tell which way is up")
+    assert found.imu.endswith("its accelerometer did not show which way is up")
     assert "turns of" in found.imu
 
 

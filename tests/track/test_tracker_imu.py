@@ -90,7 +90,7 @@ def test_an_imu_whose_clock_has_nothing_in_common_with_the_images_changes_nothin
     for one, other in zip(without.found, found.found, strict=True):
         np.testing.assert_array_equal(one.T_world_sensor, other.T_world_sensor)
     assert by.imu_use.startswith("imu: not relied on: no turn to compare with that of the images; ")
-    assert by.imu_use.endswith("its accelerometer did not tell which way is up")
+    assert by.imu_use.endswith("its accelerometer did not show which way is up")
 
 
 def test_one_that_is_right_is_said_to_be_used():

@@ -223,7 +223,7 @@ def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
     if imu is None:
         return None, ""
     rate = f", {imu.rate_hz:.0f} readings a second" if isinstance(imu, ImuReadings) else ""
-    return imu, f"the IMU helps: turns and which way is up ({imu.name}{rate}); add imu=off behind a ? to do without"
+    return imu, f"the IMU helps: turns and which way is up ({imu.name}{rate}); to disable it, add imu=off after a ?"
 
 
 class UpEstimate(NamedTuple):

@@ -223,7 +223,7 @@ class Tracker:
         """How the IMU was used so far, in one line; "" without one."""
         if self._imu is None or self._gyroscope is None:
             return ""
-        up = "gave which way is up" if self._felt_up else "did not tell which way is up"
+        up = "gave which way is up" if self._felt_up else "did not show which way is up"
         doubt = ", which may be as wrong" if self._felt_up and self._gyroscope.left_out else ""
         return f"{self._imu.name}: {self._gyroscope.use}; its accelerometer {up}{doubt}"
 

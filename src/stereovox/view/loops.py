@@ -103,8 +103,8 @@ def _draw_ways(axis: Any, closure: LoopClosure, across: Sequence[int]) -> list[A
     axis.set_aspect("equal", adjustable="datalim")
     axis.grid(alpha=0.25)
     title(axis, "The camera's path from above")
-    _draw_way(axis, closure.T_world_before, across, BEFORE, "way before")
-    _draw_way(axis, closure.T_world_sensor, across, AFTER, "way after")
+    _draw_way(axis, closure.T_world_before, across, BEFORE, "path before")
+    _draw_way(axis, closure.T_world_sensor, across, AFTER, "path after")
     closed = closure.ends(closure.loops, closure.T_world_before)
     _draw_lines(axis, closed, across, CLOSED, label=f"{len(closed):,} loops closed: one place, seen again")
     refused = closure.ends(closure.refused, closure.T_world_sensor)  # like their coordinates below

@@ -43,7 +43,7 @@ COLUMNS = {
     "ms": Column(
         "ms", -1, 1, 2, "Median processor time of a frame, of all threads: of stereovox all that it does with a depth "
         "image, of others their insertion alone. For time by the clock: stereovox bench."),
-    "map_bytes": Column("MB", -1, 1e-6, 2, "Memory of the map as the library tells it."),
+    "map_bytes": Column("MB", -1, 1e-6, 2, "Memory of the map as the library reports it."),
 }  # fmt: skip
 OF_PROBABILITIES = ("ece", "ece_likely", "ece_equal_mass", "brier", "ms", "map_bytes")
 """Shown in a second table on the page."""

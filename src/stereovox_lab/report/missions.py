@@ -17,7 +17,7 @@ HEADS = ("scene", "flights", "collisions", "ended by itself", "metres", "goals",
 FLIGHT_HEADS = ("scene", "seed", "collided, s", "seconds", "ended by itself", "metres", "goals", "clearance, m",
                 "air known", "frontiers left", "room, m")  # fmt: skip
 MISSIONS = {
-    "frontiers": "Go to the frontier nearest along the way and look at it; where none can be reached, look all round.",
+    "frontiers": "Go to the frontier nearest along the path and look at it; if none can be reached, look all round.",
     "middle": "Find the middle of the room as it is known, look round there, until it stays where it is.",
 }
 WHAT = (

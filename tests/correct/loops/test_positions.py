@@ -72,7 +72,7 @@ def test_positions_of_another_unit_or_way_are_told_from_right_ones(scale):
         assert 0 < positions.contradicted < 0.2 * positions.used
     else:
         with pytest.raises(
-            StereovoxError, match=f"contradicts the way in {positions.contradicted} of {submaps} places"
+            StereovoxError, match=f"contradicts the path in {positions.contradicted} of {submaps} places"
         ):
             positions.check_used()
 
@@ -101,5 +101,5 @@ def test_too_few_or_too_vague_positions_are_refused(length, sigma):
 def test_positions_of_which_none_is_usable_are_refused(tmp_path):
     file = tmp_path / "gnss.tum"
     file.write_text("0.0 nan nan nan 0 0 0 1\n1.0 nan nan nan 0 0 0 1\n")
-    with pytest.raises(StereovoxError, match="0 places of the way have a position"):
+    with pytest.raises(StereovoxError, match="0 places of the path have a position"):
         held(_positions(str(file), 1.0, load_config()))

@@ -78,7 +78,7 @@ def test_a_raw_drive_gives_a_page_and_all_numbers(tmp_path):
         "thesis, 0009",
         "<h3>Fig 8.4</h3>",
         "Frame by frame, default",
-        "thesis tells neither the cell size",
+        "thesis gives neither the cell size",
         "do not quote it",
         "wanted",
         "Each printed figure, judged",

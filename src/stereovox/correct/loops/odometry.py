@@ -65,11 +65,13 @@ class Odometry:
         """Raise StereovoxError if it never helped, or is of another trajectory or in another unit."""
         steps = self.used + self.contradicted
         if not steps:
-            raise StereovoxError(f"{self.where}: has no poses at the times of the map's frames; give those of this way")
+            raise StereovoxError(
+                f"{self.where}: has no poses at the times of the map's frames; give those of this path"
+            )
         if self.contradicted > self.used:
             raise StereovoxError(
                 f"{self.where}: contradicts the map's poses in {self.contradicted} of {steps} steps between places; "
-                "give poses of the camera, in metres, of this way, or say how far they drift (loops.odometry_drift)"
+                "give poses of the camera, in metres, of this path, or say how far they drift (loops.odometry_drift)"
             )
 
     def summary(self) -> dict[str, int]:

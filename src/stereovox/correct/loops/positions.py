@@ -92,8 +92,8 @@ class Positions:
         """Raise StereovoxError if they are of another trajectory or in another unit."""
         if self.contradicted > self.used:
             raise StereovoxError(
-                f"{self.where}: contradicts the way in {self.contradicted} of {self.contradicted + self.used} places; "
-                "give positions of the camera, in metres, of this way, or say how uncertain they are "
+                f"{self.where}: contradicts the path in {self.contradicted} of {self.contradicted + self.used} places; "
+                "give positions of the camera, in metres, of this path, or say how uncertain they are "
                 "(--positions-sigma) or how far its poses drift (loops.drift)"
             )
 
@@ -107,7 +107,7 @@ class Positions:
         span = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
         if len(known) < LEAST or span < WIDE * self.sigma_m:
             raise StereovoxError(
-                f"{self.where}: {len(known)} places of the way have a position, {span:.1f} m apart; {LEAST} and "
+                f"{self.where}: {len(known)} places of the path have a position, {span:.1f} m apart; {LEAST} and "
                 f"{WIDE * self.sigma_m:.1f} m are needed to know how they lie in the map"
             )
 

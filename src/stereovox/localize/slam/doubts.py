@@ -73,8 +73,8 @@ class MapDoubt:
 
 
 SENTENCES = {
-    "unseen": "scans and odometry contradict each other by {:.1f} m and more, and the robot never came back to tell "
-    "which is right; drive there again",
+    "unseen": "scans and odometry contradict each other by {:.1f} m and more, and the robot never returned to "
+    "show which is right; drive there again",
     "lost": "scans saw nothing, or nothing known; odometry alone led on, off by up to {:.1f} m, and no loop joins what "
     "came before with what came after; drive there again",
     "bent": "loops bent 20 m of the trajectory by {bend}; the wheels slipped there, or a loop is wrong",

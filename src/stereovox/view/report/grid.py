@@ -16,7 +16,7 @@ from stereovox.view.report import page
 LEAD = (
     "{} compared with {}, cell by cell, in cells of {:g} m of the reference. The error of IST 2019, Eq 7, counts every "
     "cell that differs: cells known to only one map (coverage), and cells with opposite states "
-    "(contradiction). A wall that stands one cell aside counts twice; the other measures tell it from a wrong one."
+    "(contradiction). A wall displaced by one cell counts twice; the other measures distinguish it from a wrong one."
 )
 KINDS = {
     "missed": "Known to the reference, unknown to the map: never seen, or out of the sensor's range.",

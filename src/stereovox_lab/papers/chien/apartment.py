@@ -47,7 +47,7 @@ PAPER = (
     "straight and the corner is 90 degrees. The floor plan stands next to it; 255 is occupied, 0 free."
 )
 OUR_PICTURE = (
-    "True floor plan (walls black, furniture brown) with the camera's way; how far the tracker is off; then the "
+    "True floor plan (walls black, furniture brown) with the camera's path; how far the tracker is off; then the "
     "layer at the first camera's height of each map, with the true walls as thin lines. Grey is unknown."
 )
 MEASURES = (
@@ -112,7 +112,7 @@ def _floor_plan(axis: Any, plan: Sequence[tuple[str, NDArray[np.float64]]], way:
         axis.fill(*polygon.T, color=INK if part == "walls" else "#cdb48c")
     axis.plot(way[:, 0], way[:, 2], color=PATH_COLOUR, linewidth=1)
     axis.set_aspect("equal")
-    title(axis, "True floor plan at the camera's height, and the way")
+    title(axis, "True floor plan at the camera's height, and the path")
     measured(axis, ("x", "z", "y"))
 
 

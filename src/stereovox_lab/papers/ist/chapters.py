@@ -33,12 +33,12 @@ ERROR_HEADS = ("error, Eq 7 [%]", "of it coverage", "of it contradiction")
 EQ7 = (
     "Error: IST 2019, Eq 7: cells whose state (unknown, free, occupied) differs, over the free and occupied cells of "
     "the reference. It is the sum of two things: coverage, cells that only one of the maps knows, and contradiction, "
-    "cells that both know and call by opposite states. A wall that stands one cell of 2 cm aside counts twice in it, "
+    "cells with opposite states in both. A wall displaced by one cell of 2 cm counts twice in it, "
     "and so does every cell of a wall that is drawn thicker; walls within one cell and the metres between walls "
     "forgive that. Maps and reference have one frame, that of the localisation; nothing was aligned afterwards."
 )
 POSES = (
-    "Odometry: as the Pioneer's wheels tell it, without localisation. True poses: those of the simulation, moved as a "
+    "Odometry: as the Pioneer's wheels report it, without localisation. True poses: of the simulation, moved as a "
     "whole to the reference's frame; what is left is not due to localisation."
 )
 BAND = (
@@ -175,7 +175,7 @@ def fans_chapter(many: Fan, few: Fan) -> Chapter:
     )
     method = (
         f"{MANY} beams over {FIELD_DEG:g} degrees, then {len(FEW)}, into an empty grid of 2 cm cells. The report does "
-        "not tell the distances."
+        "not give the distances."
     )
     told = {"many": many, "few": few}
     numbers = {
@@ -245,7 +245,7 @@ def _method(found: Survey, place: Place | None) -> str:
     return (
         f"{where}{size}{len(robot.scans)} scans and {len(robot.frames)} depth images. Reference map: SLAM from "
         f"{len(first.scans)} scans {other}({found.reference.slam.closures} loops closed), written as map_server files "
-        f"and read back. Localisation in it by AMCL, mapping along that way{door}."
+        f"and read back. Localisation in it by AMCL, mapping along that path{door}."
     )
 
 
@@ -266,10 +266,10 @@ def _shown(found: Survey, places: tuple[str, str, str], simulated: bool) -> list
     )
     return [
         Shown(reference, first, "By our SLAM, with the robot's way.", pictures[0]),
-        Shown(mapped, second, f"Along the way that AMCL found: {theirs.made.variant.what}.", pictures[1]),
+        Shown(mapped, second, f"Along the path that AMCL found: {theirs.made.variant.what}.", pictures[1]),
         Shown(difference, third, f"Profile ist2019: {_percent(theirs)} of the cells.", binary_png(theirs.laid)),
         Shown("How they differ, ist2019", "", _percent(theirs), difference_png(theirs.laid)),
-        Shown("Map under default", "", f"The same way: {ours.made.variant.what}.", pictures[2]),
+        Shown("Map under default", "", f"The same path: {ours.made.variant.what}.", pictures[2]),
         Shown("How they differ, default", "", _percent(ours), difference_png(ours.laid)),
     ]
 

@@ -43,7 +43,7 @@ TRUTH = (
 )
 OTHER_DATA = (
     "The thesis's rows are its own printed figures, of other drives than ours unless sequences 0000 to 0009 of the "
-    "tracking data stand below them; the thesis tells neither the cell size nor the range of its table."
+    "tracking data stand below them; the thesis gives neither the cell size nor the range of its table."
 )
 MEASURES = (
     "Exact and within one cell: a cell called occupied is right where the truth has a surface in it, or within one "
@@ -62,7 +62,7 @@ RULES = (
     "its last digit, rounded or cut off. The profile valenti2018: over a whole drive it is no worse than the printed "
     "row of the same sequence, to half of the last digit; on a drive that the table has not, no worse than the worst "
     "of its ten rows. default: better than that row, or than the best of the ten. What cannot be judged is said to be "
-    "so: the counts, which go with a cell size and a range that the thesis does not tell, and sequences that are not "
+    "so: the counts, which go with a cell size and a range that the thesis does not give, and sequences that are not "
     "at hand."
 )
 RIVAL = (
@@ -280,7 +280,7 @@ def _shown(maps: Sequence[Apart]) -> list[Shown]:
               "Each line is one map at all thresholds over the part that is scored, truth: free is all in view; dots: "
               "p > 0.7, rings: p >= 0.7, diamonds: the threshold chosen elsewhere. The green corner is the target.",
               tolerances_png(maps)),
-        Shown("Can the probabilities be believed?", "",
+        Shown("Are the probabilities correct?", "",
               "Of all observed cells with a probability, the share that is truly occupied. Below the dashed line a map "
               "claims too much.", reliabilities_png(maps)),
     ]  # fmt: skip

@@ -101,7 +101,7 @@ def own_claims() -> list[Claim]:
         wrong = [f"{sequence}: {value:.3f}" for (sequence, what), value in off.items() if what == name]
         ours = f"by their counts {', '.join(wrong)}" if wrong else "all ten do"
         claims.append(Claim(f"printed {name} agrees with the row's own counts", "ten rows", ours, not wrong))
-    why = "cannot be told from the counts"
+    why = "cannot be derived from the counts"
     return [*claims, *(Claim(f"printed {name}", "ten rows", "-", None, why) for name in RATES if name not in COUNTED)]
 
 
@@ -119,7 +119,7 @@ def absent_claims(drives: Iterable[str]) -> list[Claim]:
     there = {row.sequence for drive in drives if (row := row_of_drive(drive))}
     absent = [row.sequence for row in PRINTED if row.sequence not in there]
     claims = [Claim("tp, fp, tn, fn of the ten rows", "as printed", "-", None,
-                    "they go with the cell size and range, which the thesis does not tell")]  # fmt: skip
+                    "they go with the cell size and range, which the thesis does not give")]  # fmt: skip
     if absent:
         text = f"figures of sequence{'s' * (len(absent) > 1)} {', '.join(absent)}"
         claims.append(Claim(text, "as printed", "-", None, "not among the drives of --data"))

@@ -262,14 +262,17 @@ def test_what_kills_workers_is_named(scheduler):
             list(run.results(dies, {"drives/a": (f"dies-{run._name}-drives/a",)}))
 
 
-@pytest.mark.parametrize("kind", ["seen.npy", "manifest.json", "frames-*"])
-def test_damage_of_what_is_kept_is_told_with_the_cure(mapped, tmp_path, kind):
+def test_damage_of_what_is_kept_is_told_with_the_cure(mapped, tmp_path):
     mapped([recording(1)], tmp_path / "m.svox")
     (tmp_path / "m.svox/manifest.json").unlink()
-    for file in (tmp_path / "m.svox/recordings").glob(f"*/{kind}"):
-        file.write_bytes(file.read_bytes()[:-9] if kind == "frames-*" else b"")
-    with pytest.raises(MapFileError, match=r"recordings/\w+: is damaged [^;]*; remove it and run again with --resume"):
-        mapped([recording(1)], tmp_path / "m.svox", resume=True)
+    for kind in ("seen.npy", "manifest.json", "frames-*"):
+        whole = {file: file.read_bytes() for file in (tmp_path / "m.svox/recordings").glob(f"*/{kind}")}
+        for file, data in whole.items():
+            file.write_bytes(data[:-9] if kind == "frames-*" else b"")
+        with pytest.raises(MapFileError, match=r"recordings/\w+: is damaged [^;]*; remove it and run again with --res"):
+            mapped([recording(1)], tmp_path / "m.svox", resume=True)
+        for file, data in whole.items():
+            file.write_bytes(data)
     shutil.rmtree(tmp_path / "m.svox/recordings")
     mapped([recording(1)], tmp_path / "m.svox", resume=True)
     assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
@@ -317,7 +320,11 @@ def test_two_fleets_do_not_write_one_map(mapped, where):
 
 
 @pytest.mark.usefixtures("obeys_signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [("folder", signal.SIGINT), ("s3", signal.SIGTERM), ("folder", signal.SIGHUP)],
+    indirect=["where"],
+)
 def test_a_fleet_that_is_told_to_end_gives_the_map_to_the_next(mapped, where, monkeypatch, number):
     before = signal.getsignal(number)
 

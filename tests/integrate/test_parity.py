@@ -45,13 +45,14 @@ def assert_rays_equal_their_reference(image, config, at_least):
 def test_projective_equals_its_reference(model, voxel_size):
     config = load_config(voxel_size=voxel_size, max_range=2.5, **{"sensor.model": model})
     integrator = make_integrator(config)
-    image = made_image(([*SENSORS].index(model) + SIZES.index(voxel_size)) % 3)  # each model and size has all three
-    ours = cells_of(integrator.evidence(image))
-    theirs = reference_of(naive_integrators.project, image, config)
-    assert len(theirs) > 60
-    # float32 against float64: a few cells project on a pixel's edge or lie on a table column's edge
-    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
-    assert share_that_differs(ours, theirs) < 0.02
+    for seed in range(3 if voxel_size > SIZES[-1] else 1):  # the smallest cells take longest
+        image = made_image(seed)
+        ours = cells_of(integrator.evidence(image))
+        theirs = reference_of(naive_integrators.project, image, config)
+        assert len(theirs) > 60
+        # float32 against float64: a few cells project on a pixel's edge or lie on a table column's edge
+        assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+        assert share_that_differs(ours, theirs) < 0.02
 
 
 @pytest.mark.parametrize("model", SENSORS)
@@ -94,7 +95,7 @@ class Tail(Late):
 
 
 @pytest.mark.parametrize("model", [Late(False), Late(True), Tail(False)], ids=["late", "marks late", "tail"])
-@pytest.mark.parametrize(("voxel_size", "far_share"), [(0.1, 0.0), (0.05, 0.1)])
+@pytest.mark.parametrize(("voxel_size", "far_share"), [(0.1, 0.0), (0.1, 0.1), (0.05, 0.1)])
 def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, monkeypatch):
     from stereovox.integrate import projective
 
@@ -107,11 +108,12 @@ def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, mon
 
 
 COVERED = [
-    (*how, model, SIZES[(i + j) % 3])
+    (*how, model, voxel_size)
     for i, how in enumerate(product(["ray", "line"], ["once", "every"]))
     for j, model in enumerate(SENSORS)
+    for voxel_size in (SIZES[0], SIZES[1 + (i + j) % 2])
 ]
-"""Each integrator and update with each model and each size, each model with each size, but not each with all."""
+"""All with the largest cells, where a cell ends far from its centre; each pair with the others, which take longest."""
 
 
 @pytest.mark.parametrize(("integrator", "update", "model", "voxel_size"), COVERED)

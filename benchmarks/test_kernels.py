@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stages of a frame one by one, on a simulated image: `pytest benchmarks/test_kernels.py`.
+"""The stages of a frame one by one, on a simulated image: `pytest -p benchmark benchmarks/test_kernels.py`.
 
 Needs pytest-benchmark (`pip install 'stereovox[bench]'`). Compare two versions with `--benchmark-save` and
 `--benchmark-compare`. Cells and range are the default profile's unless a test's name says otherwise.

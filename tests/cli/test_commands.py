@@ -263,11 +263,11 @@ def test_memory_of_a_window_is_told_apart(recording, tmp_path, capsys):
     assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1, *window) == 0
     assert ", reserved for the window" in capsys.readouterr().err
     assert run("info", tmp_path / "m") == 0
-    assert "in memory once loaded, besides what its window reserved" in capsys.readouterr().err
+    assert "in memory once loaded, in addition to its window's reserve" in capsys.readouterr().err
     assert run("map", recording, "--out", tmp_path / "n", "--voxel-size", 0.1) == 0
     assert "reserved" not in capsys.readouterr().err
     assert run("info", tmp_path / "n") == 0
-    assert "window reserved" not in capsys.readouterr().err
+    assert "window's reserve" not in capsys.readouterr().err
 
 
 def test_bench_without_peers_installed_times_stereovox_and_says_what_to_install(recording, capsys, monkeypatch):

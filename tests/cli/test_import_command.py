@@ -56,7 +56,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),
         (["import", "room.ply", "m.yaml"], "room.ply: holds a map in space"),
         (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map reports"),
-        (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap reports how large its cells are"),
+        (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap has its own cell size"),
         (["import", "room.svox", "m"], "room.svox"),
         (
             ["export", "room.svox", "m.bag", "--heights", "90:99", "--floor=0"],

@@ -215,7 +215,7 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
         (("grid", DRIVE, "--out", "a.pgm", "--mode", "scale"), "mode scale has no grey for unknown cells"),
         (("map", "sim:room", "--out", "a.yaml"), "names a floor's map"),
         (("map", "sim:room", "--out", "a.svox", "--rerun", "notes.txt"), "end the file's name with .rrd"),
-        (("localize", DRIVE, ".", "--out", "a.tum"), ".: no map of a floor; make one"),
+        (("localize", DRIVE, ".", "--out", "a.tum"), ".: not a map of a floor; make one"),
         (("slam", "sim:room", "--out", "a.yaml"), "there is sim:floor"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum", "--start", "1,2"), "--start 1,2: give X,Y,DEG"),
         (("simulate", "sim:floor?plan=castle", "--out", "a.bag"), "castle"),

@@ -55,7 +55,7 @@ def test_a_depth_camera_looks_ahead(capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((DRONE, "--step", "7"), "step_deg must go into 180"),
+        ((DRONE, "--step", "7"), "step_deg must divide 180"),
         ((DRONE, "--out", "sphere.jpg"), "--out sphere.jpg: end the file's name with .png"),
         (("sim:surround?pair=up",), "pair=up is unknown"),
         (("nowhere",), "no such folder"),

@@ -110,7 +110,7 @@ def test_given_poses_that_are_not_there_are_a_mistake(here, capsys):
 def test_info_says_that_the_camera_is_tracked(here, capsys):
     unposed(here / "desk", 3)
     status, _, err = run(capsys, "info", "desk")
-    assert (status, "map tracks the camera by its own images" in err) == (0, True)
+    assert (status, "map tracks the camera by visual odometry" in err) == (0, True)
     assert "stereovox map desk --out desk.svox" in err
 
 

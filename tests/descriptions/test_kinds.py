@@ -42,7 +42,7 @@ def test_a_recording(recording):
 def test_images_without_poses_say_what_is_missing_and_what_they_are_good_for(recording):
     (recording / "poses.txt").unlink()
     found = sv.describe(recording)
-    assert any("map tracks the camera by its own images" in line for line in found.lines)
+    assert any("map tracks the camera by visual odometry" in line for line in found.lines)
     assert found.commands[0] == f"stereovox map {recording} --out scan.svox"
     assert "?poses=FILE" in found.commands[1]
     assert (found.facts["posed"], "no poses" in found.facts["missing"]) == (0, True)

@@ -35,10 +35,10 @@ MARK = "/tmp/stereovox-was-here"
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (REPEATED, "unfold to too many"),
-        (MERGED, "unfold to too many"),
-        ("a: &a [*a]", "hold themselves"),
-        ("a: &a {b: *a}", "hold themselves"),
+        (REPEATED, "expand to too many"),
+        (MERGED, "expand to too many"),
+        ("a: &a [*a]", "contain themselves"),
+        ("a: &a {b: *a}", "contain themselves"),
         ("[" * 3000, "nested too deeply"),
         ("a: " + "{a: [" * 3000, "nested too deeply"),
         ("- " * 3000, "nested too deeply"),
@@ -85,7 +85,7 @@ def test_pipes_devices_and_folders_are_no_files(tmp_path):
     for path, said in ((tmp_path / "pipe", "not a file"), (tmp_path, "directory"), (tmp_path / "none", "No such")):
         with pytest.raises(OSError, match=said):
             read_bounded(path)
-    with pytest.raises(SourceError, match="pipe: not a file; give a TOML file"):
+    with pytest.raises(SourceError, match="pipe: not a file; give a readable TOML file"):
         read_camera(tmp_path / "pipe")
     with pytest.raises(OSError, match="not a file"):
         read_bounded("/dev/zero")

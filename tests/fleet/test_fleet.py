@@ -406,7 +406,7 @@ def test_what_cannot_be_used_of_an_object_store_is_named_as_there(mapped, s3, tm
     said = [one.error for one in made.recordings]
     assert said[:2] == ["", f"no recording itself; did you mean {above}/city/drive?"]
     assert said[2].startswith(f"{above}/new.tum: holds no pose")
-    assert said[3] == "s3://no-such-bucket: there is no such bucket; check the name, or make it"
+    assert said[3] == "s3://no-such-bucket: there is no such bucket; check the name, or create it"
     assert all(f"{above}/city/drive/camera.toml" in one.notes[0] for one in made.recordings[2:3])
 
 

@@ -70,7 +70,7 @@ def test_a_cell_size_is_suggested_for_each_kind(tmp_path, kind):
     assert made.counts() == {"free": 0, "tentative": 0, "occupied": 40 * 20}
     assert made.history.imported.file == path.name
     assert "5,000 points" in made.history.imported.holds
-    assert "cells of 0.05 m, since its points lie about 0.02 m apart (--voxel-size overrides)" in notes(made)
+    assert "cells of 0.05 m, since its points are about 0.02 m apart (--voxel-size overrides)" in notes(made)
     assert import_map(path, voxel_size=0.5).voxel_size == 0.5
 
 
@@ -200,7 +200,7 @@ def test_faces_of_four_corners_and_bare_corners(tmp_path):
     (tmp_path / "a.ply").write_text(f"{head}element face 0\nend_header\n{corners}")
     assert import_map(tmp_path / "a.ply", voxel_size=0.1).counts()["occupied"] == 4
     (tmp_path / "a.ply").write_text(f"{head}{face}{corners}4 0 1 2 9\n")
-    with pytest.raises(MapFileError, match="no mesh that can be read"):
+    with pytest.raises(MapFileError, match="not a readable mesh"):
         import_map(tmp_path / "a.ply", voxel_size=0.1)
 
 
@@ -212,7 +212,7 @@ def test_a_kitti_scan(tmp_path):
     with pytest.raises(MapFileError, match="no whole number of points"):
         import_map(tmp_path / "0.bin")
     (tmp_path / "0.bin").write_bytes(np.full(400, 1e9, "<f4").tobytes())
-    with pytest.raises(MapFileError, match="no KITTI velodyne scan"):
+    with pytest.raises(MapFileError, match="not a KITTI velodyne scan"):
         import_map(tmp_path / "0.bin")
 
 
@@ -220,13 +220,13 @@ def test_a_kitti_scan(tmp_path):
     ("name", "content", "options", "said"),
     [
         ("a.xyz", b"", {}, "no line of three numbers"),
-        ("a.xyz", b"1 2 3\n4 5\n", {}, "no points that can be read"),
-        ("a.xyz", b"\xff\xfe\x00\x01", {}, "is no text"),
-        ("a.csv", b"time,lat,lon\n1,2,3\n", {}, "no columns x, y and z"),
+        ("a.xyz", b"1 2 3\n4 5\n", {}, "no readable points"),
+        ("a.xyz", b"\xff\xfe\x00\x01", {}, "is not text"),
+        ("a.csv", b"time,lat,lon\n1,2,3\n", {}, "without columns x, y and z"),
         ("a.xyz", b"1 2 3\n4 5 6\n", {}, "type: stereovox import a.xyz MAP --voxel-size 0.05"),
         ("a.xyz", b"nan 2 3\n", {"voxel_size": 1.0}, "holds no point"),
-        ("a.txt", b"1311868164.3 1 2 0 0 0 0 1\n" * 3, {}, "lies beyond the Earth"),
-        ("a.xyz", b"1 2 3\n", {"unit": "mile"}, "--unit mile: no unit that is known; give one of m, cm"),
+        ("a.txt", b"1311868164.3 1 2 0 0 0 0 1\n" * 3, {}, "is beyond the Earth"),
+        ("a.xyz", b"1 2 3\n", {"unit": "mile"}, "--unit mile: unknown unit; give one of m, cm"),
         ("a.xyz", b"1 2 3\n", {"heights": (0, 1)}, "--heights says nothing"),
         ("a.pcd", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", {}, "git lfs pull"),
         ("a.stl", b"solid\n", {}, "a.stl"),

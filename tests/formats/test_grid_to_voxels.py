@@ -57,7 +57,7 @@ def test_a_turned_floor_never_frees_what_is_not_free(origin):
 
 def test_a_floor_without_heights_says_what_takes_it(tmp_path):
     write_map_server(floor(), tmp_path / "map.yaml")
-    with pytest.raises(StereovoxError, match="info, picture, eval, localize and path take it") as error:
+    with pytest.raises(StereovoxError, match="info, picture, eval, localize and path read it") as error:
         import_map(tmp_path / "map.yaml")
     assert len(str(error.value)) - len(str(tmp_path)) <= 250
     for heights in ((1, 0), (0, 1e6)):

@@ -50,7 +50,7 @@ def png(width, height, data):
         (b"P2 16000 16000 255\n" + b"0 " * 100, "holds no 16000 x 16000 pixels"),
         (b"P5 -1 -1 255\n", "no PGM's"),
         (png(5000, 5000, bytes(5001 * 100)), "a map has 1 to 4194304"),
-        (png(2**31 - 1, 2**31 - 1, b""), "damaged or no picture"),
+        (png(2**31 - 1, 2**31 - 1, b""), "damaged or not a picture"),
     ],
 )
 def test_a_picture_that_claims_too_much(tmp_path, data, said):
@@ -115,10 +115,10 @@ def test_a_tree_whose_size_lies(tmp_path, size):
 
 def test_a_tree_that_claims_the_whole_world(tmp_path):
     said = refusal(read_octomap, tree(tmp_path / "a.bt", struct.pack("<H", 1), 2))
-    assert "its nodes stand for up to 3.52e+13 cells" in said
+    assert "its nodes expand to up to 3.52e+13 cells" in said
     whole = b"# Octomap OcTree file\nid OcTree\nsize 1\nres 0.1\ndata\n" + struct.pack("<fB", 1.0, 0)
     (tmp_path / "a.ot").write_bytes(whole)
-    assert "its nodes stand for up to" in refusal(read_octomap, tmp_path / "a.ot")
+    assert "its nodes expand to up to" in refusal(read_octomap, tmp_path / "a.ot")
 
 
 def test_a_tree_deeper_than_sixteen_levels(tmp_path):

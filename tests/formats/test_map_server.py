@@ -168,7 +168,7 @@ def test_a_failed_write_leaves_both_older_files_whole(tmp_path, monkeypatch):
     ("arguments", "match"),
     [
         (("map.tif",), "ends in .yaml, .pgm or .png"),
-        (("map.yaml", "scaled"), "no mode 'scaled'.*did you mean 'scale'"),
+        (("map.yaml", "scaled"), "unknown mode 'scaled'.*did you mean 'scale'"),
         (("map.pgm", "scale"), "no grey for unknown cells; name a .png"),
         (("map.yaml", "raw", True), "leave out negate"),
         (("no/map.yaml",), "cannot be written"),
@@ -197,7 +197,7 @@ BAD = {
     "resolution_text": ({"resolution": "five"}, "no number"),
     "resolution_huge": ({"resolution": "1" * 400}, "no number"),
     "origin_short": ({"origin": "[1, 2]"}, "give \\[x, y, yaw\\]"),
-    "origin_text": ({"origin": "[1, 2, north]"}, "origin 'north' is no number"),
+    "origin_text": ({"origin": "[1, 2, north]"}, "origin 'north' is not a number"),
     "thresholds": ({"free_thresh": "0.7"}, "must rise"),
     "mode": ({"mode": "binary"}, "mode 'binary'"),
     "not_yaml": ({"image": "[\n}"}, "no YAML"),

@@ -88,7 +88,7 @@ def test_bt_keeps_free_and_what_is_likely_occupied(folder, cells):
 def test_an_empty_map_is_neither_written_nor_read(tmp_path, ending):
     """A file that loads as empty says that nothing is known, which nobody notices."""
     path = tmp_path / f"empty{ending}"
-    with pytest.raises(MapFileError, match="holds no cell that such a file knows, there is nothing to write"):
+    with pytest.raises(MapFileError, match="holds no cell that this format can store, there is nothing to write"):
         export(VoxelMap(CONFIG), path)
     assert not path.exists()
     export(map_of({(0, 0, 0): OCCUPIED}), path)

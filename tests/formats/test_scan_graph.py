@@ -74,7 +74,7 @@ def test_a_cell_that_one_scan_hits_and_another_passes_is_tentative(tmp_path):
 @pytest.mark.parametrize(
     ("content", "options", "said"),
     [
-        (b"", {}, "no OctoMap scan graph, or a damaged one"),
+        (b"", {}, "not an OctoMap scan graph, or damaged"),
         (b"\x02\0\0\0", {}, "damaged"),
         (b"\xff" * 400, {}, "damaged"),
         (struct.pack("<2I", 1, 0) + struct.pack("<i3di4dI", 3, 0, 0, 0, 4, 0, 0, 0, 0, 0), {}, "pose"),

@@ -232,7 +232,7 @@ def test_a_run_says_which_map_it_replaces(tmp_path):
 
 def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
     for name in ("a.yaml", "a.yml", "a.pgm", "a.PNG"):
-        with pytest.raises(sv.StereovoxError, match=r"names a floor's map; end the name of a map in space in \.svox"):
+        with pytest.raises(sv.StereovoxError, match=r"names a floor's map; give a map in space the ending \.svox"):
             sv.map_recording(SOURCE, tmp_path / name, **SETTINGS)
     with pytest.raises(sv.StereovoxError, match="map_floor"):
         sv.map_recording(SOURCE, tmp_path / "a.svox", dimensions=2)

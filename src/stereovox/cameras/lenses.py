@@ -18,15 +18,15 @@ from stereovox.cameras.pinhole import check_numbers
 from stereovox.errors import StereovoxError, did_you_mean
 
 MODELS = {"pinhole": 8, "fisheye": 4}
-"""Lens models and the largest number of their coefficients."""
+"""Lens models and their largest numbers of coefficients."""
 COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """Numbers of coefficients that a calibration may have; any other number in a file is an error."""
 FARTHEST = {"pinhole": math.radians(89.9), "fisheye": math.pi}
-"""Angle off the axis in radians where the model ends."""
+"""Largest angle off the axis in radians that the model covers."""
 LARGEST = 1e9
-"""Bound of the coefficients; polynomials with larger ones leave the range of float64."""
+"""Bound of the coefficients; larger ones overflow float64."""
 STEPS = 2000
-"""Angles in the table from which the inverse starts."""
+"""Angles in the table that starts the inverse."""
 ROUNDS = 12
 """Newton steps of the inverse."""
 GOOD = 1e-10
@@ -35,7 +35,7 @@ GOOD = 1e-10
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as calibrated.
+    """A calibrated camera with distortion.
 
     model: `pinhole` with up to 8 coefficients of Brown and Conrady (k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order), or
     `fisheye` with the four of Kannala and Brandt; missing ones are zero. fx, fy, cx, cy in pixels.
@@ -63,7 +63,7 @@ class Lens:
 
     @classmethod
     def from_field_of_view(cls, model: str, width: int, height: int, hfov_deg: float) -> Lens:
-        """Return a lens without distortion whose pixel borders span `hfov_deg` across; a fisheye is even in angle."""
+        """Return a lens without distortion whose outer pixel edges span `hfov_deg`; a fisheye is linear in angle."""
         half = math.radians(hfov_deg) / 2
         if not 0 < half < (math.pi / 2 if model == "pinhole" else math.pi):
             raise StereovoxError(f"lens: a {model} cannot see {hfov_deg} deg; give less")
@@ -85,9 +85,9 @@ class Lens:
         return min(math.atan(steepest), FARTHEST["pinhole"])
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return the (N, 2) pixels, inside the image or not, at which (N, 3) points of the optical frame are seen.
+        """Return the (N, 2) pixels, inside the image or not, that show the (N, 3) points of the optical frame.
 
-        NaN where the lens does not see: behind a pinhole, beyond `widest`, at the lens itself.
+        NaN for points that the lens cannot see: behind a pinhole, beyond `widest`, at the lens itself.
         """
         x, y, z = np.asarray(points, float).T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -102,7 +102,7 @@ class Lens:
         return np.where(seen[:, None], plane * (self.fx, self.fy) + (self.cx, self.cy), np.nan)
 
     def directions(self, pixels: ArrayLike) -> NDArray[np.float64]:
-        """Return the (N, 3) unit rays of (N, 2) pixels; NaN where the lens sees nothing (see `widest`)."""
+        """Return the (N, 3) unit rays of (N, 2) pixels; NaN for pixels that show nothing (see `widest`)."""
         plane = (np.asarray(pixels, float) - (self.cx, self.cy)) / (self.fx, self.fy)
         radius = np.hypot(*plane.T)
         angle = self._angles(radius)
@@ -136,13 +136,13 @@ class Lens:
         return np.stack([across, down], axis=1)
 
     def _angles(self, radius: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the angles off the axis that fall about at these radii in focal lengths; NaN beyond the widest."""
+        """Return the approximate angles off the axis of these radii in focal lengths; NaN beyond the widest."""
         angles = np.linspace(0, self.widest, STEPS)
         if self.model == "fisheye":
             return np.interp(radius, self._bent(angles), angles, right=np.nan)
         k, s = self._k, np.tan(angles) ** 2
         radial = np.polyval([k[4], k[1], k[0], 1], s) / np.polyval([k[7], k[6], k[5], 1], s)
-        return np.interp(radius, np.tan(angles) * radial, angles)  # the edge: tangential distortion may reach further
+        return np.interp(radius, np.tan(angles) * radial, angles)  # clamped: tangential distortion may reach further
 
     def _unbent(self, angle: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
         rates = self._k * (3, 5, 7, 9)
@@ -165,7 +165,7 @@ class Lens:
         return np.where(found[:, None], slopes, np.nan)
 
     def _rates(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (N, 2, 2) derivatives of `_distorted`, by differences: it is smooth and of the order of one."""
+        """Return the (N, 2, 2) derivatives of `_distorted` by differences, since it is smooth and of order one."""
         step = 1e-6
         sides = [(self._distorted(slopes + d) - self._distorted(slopes - d)) / (2 * step) for d in step * np.eye(2)]
         return np.stack(sides, axis=2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A lidar, or anything else that measures points one by one: what its ranges can be trusted for."""
+"""A lidar, or any other sensor that measures single points: its range limits and noise."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import ClassVar
 from stereovox.errors import StereovoxError
 
 USUAL_SIGMA_M = 0.02
-"""Of common spinning lidars (Velodyne HDL-64E, VLP-16, Ouster OS1: 2 to 3 cm)."""
+"""Typical of spinning lidars (Velodyne HDL-64E, VLP-16, Ouster OS1: 2 to 3 cm)."""
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """What the ranges of a lidar can be trusted for; the same for all of its clouds.
+    """Range limits and noise of a lidar; the same for all of its clouds.
 
     Attributes:
         sigma: Standard deviation of a range in metres.
         range_min: Metres below which a point is left out: the vehicle itself, or dirt on the window.
-        range_max: Metres beyond which a point is no surface; its ray is then free up to there, and no nearer to
+        range_max: Metres beyond which a point is no surface; its ray is then free up to there, but no nearer to
             the point than four sigma.
         baseline: None: a lidar has no stereo geometry.
-        width: 1, as `height`: what a lidar adds to caches that count the pixels of cameras.
+        width: 1, as `height`: a lidar's share in caches that count the pixels of cameras.
         height: 1.
 
     Raises:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pinhole camera, the ray convention of all camera models, and depth corrections.
 
-Optical frame: x right, y down, z forward. Pixel centres lie at whole numbers. For all cameras here the point that
-pixel (u, v) sees at depth d is
+Optical frame: x right, y down, z forward. Pixel centres are at whole numbers. For all cameras here, pixel (u, v)
+at depth d shows the point
 
     d * (columns[u], rows[v, 0], rows[v, 1])        with `columns, rows = camera.rays()`
 
-so the rows of a pair whose eyes are side by side along x are straight lines. Depth is the distance along z for a
+so the rows of a pair whose eyes are next to each other along x are straight lines. Depth is the distance along z for a
 pinhole camera, and the distance from the x axis, on which both eyes lie, for a spherical or cylindrical one.
 """
 
@@ -33,11 +33,11 @@ LIMITS = {
 }
 """Limits of a camera's numbers: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
 WHOLE = "pixels", "binning"
-"""Those that must be whole numbers."""
+"""Keys of LIMITS whose values must be whole numbers."""
 STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}
 """Fields of all depth cameras, with the key of their limits."""
 MAX_COEFFICIENT = 1e36
-"""Larger coefficients of a correction leave the range of float32."""
+"""Larger coefficients of a correction overflow float32."""
 STEEPEST = 20.0
 """Largest x/z or y/z at the borders of a pinhole camera's image: 87 degrees off the axis."""
 CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
@@ -93,7 +93,7 @@ def check_numbers(camera: object, **kinds: str) -> None:
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """An undistorted pinhole camera. The centre of pixel (u, v) lies at (u, v).
+    """An undistorted pinhole camera. The centre of pixel (u, v) is at (u, v).
 
     Attributes:
         width: Columns of the image.
@@ -129,7 +129,7 @@ class PinholeCamera:
         if steepest > STEEPEST:
             angle = math.degrees(math.atan(steepest))
             raise StereovoxError(
-                f"camera {self}: a ray {angle:.1f} deg off the axis is none of a pinhole; check fx, fy, cx, cy"
+                f"camera {self}: a ray {angle:.1f} deg off the axis is impossible for a pinhole; check fx, fy, cx, cy"
             )
 
     @classmethod
@@ -190,7 +190,7 @@ class PinholeCamera:
         """Return the volume of the view.
 
         Args:
-            depth: Depth in metres where the view ends.
+            depth: Depth in metres at which the view ends.
 
         Returns:
             Cubic metres.
@@ -211,7 +211,7 @@ class PinholeCamera:
 
         Args:
             disparity: (height, width) in pixels, above 0.
-            aligned: Eye that the disparities belong to, `left` or `right`; has no influence here.
+            aligned: Eye that the disparities belong to, `left` or `right`; ignored here.
 
         Returns:
             (height, width) float64 metres; NaN without a baseline.

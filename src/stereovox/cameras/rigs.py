@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo pairs: two eyes side by side, their mount on the vehicle, and the virtual camera they are rectified to."""
+"""Stereo pairs: two eyes next to each other, their mount on the vehicle, and the virtual camera of rectified images."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ MODELS = ("pinhole", "spherical", "cylindrical")
 USUAL_DEG = {"spherical": (170.0, 180.0), "cylindrical": (120.0, 180.0)}
 """Largest default field of view, across and down, of a wide camera."""
 SIDEWAYS_DEG = 45.0
-"""Largest angle of the baseline to the x axis of the left eye."""
+"""Largest angle between the baseline and the x axis of the left eye."""
 
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
     """The raw cameras of a pair: lenses, and T_left_right (4, 4), which maps the right optical frame into the left.
 
-    Their images are distorted and must be rectified. Raises StereovoxError for a T_left_right that is no rigid motion,
-    or that does not place the right eye to the right of the left one.
+    Their images are distorted and must be rectified. Raises StereovoxError if T_left_right is not a rigid motion, or
+    does not place the right eye to the right of the left one.
     """
 
     left: Lens
@@ -48,8 +48,8 @@ class Eyes:
         if not place[0] > math.cos(math.radians(SIDEWAYS_DEG)) * self.baseline > 0:
             seen = " ".join(f"{number:.4g}" for number in place)
             raise StereovoxError(
-                f"eyes: seen from the left eye the right one is at {seen} m, not to its right (+x); "
-                "exchange the eyes, or turn the images of eyes above each other"
+                f"eyes: in the left eye's frame the right one is at {seen} m, not to its right (+x); "
+                "exchange the eyes, or rotate the images if one eye is above the other"
             )
 
     @property
@@ -58,7 +58,7 @@ class Eyes:
         return float(np.linalg.norm(self.T_left_right[:3, 3]))
 
     def rectifying_rotations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the (3, 3) rotations from rectified coordinates into those of the left and of the right eye.
+        """Return the (3, 3) rotations from rectified coordinates into the frames of the left and the right eye.
 
         The rectified x axis runs along the baseline; z is the mean of both optical axes, made orthogonal to it.
         """
@@ -78,10 +78,10 @@ class StereoPair:
     Attributes:
         camera: The rectified left eye, with the baseline; the rectified right eye is the same camera, moved by the
             baseline along x.
-        eyes: The raw cameras that the images come from; None if images are rectified already.
+        eyes: The raw cameras that the images come from; None if images are already rectified.
         T_body_camera: (4, 4) maps the rectified left optical frame into the vehicle's (x forward, y left, z up).
         valid: (height, width) bool of the rectified left image: False if parts of the vehicle block the view or the
-            lens sees nothing; None: all pixels may be used.
+            pixel is outside the lens's view; None: all pixels may be used.
         name: For messages.
         valid_right: As `valid`, for the rectified right image.
     """
@@ -106,7 +106,7 @@ class StereoPair:
         valid: NDArray[np.bool_] | None = None,
         name: str = "stereo",
     ) -> StereoPair:
-        """Return a pair that is rectified to a virtual camera, made by `virtual_camera`.
+        """Return a pair that is rectified to a camera from `virtual_camera`.
 
         Args:
             eyes: The raw cameras.
@@ -141,10 +141,10 @@ def virtual_camera(
     """Return the camera that images of `eyes` are rectified to.
 
     model: `pinhole`, `spherical` or `cylindrical`. size: width and height in pixels. hfov_deg, vfov_deg: angles between
-    the borders of the image, across and down. What is not given: the resolution in the middle of the lenses is kept; a
-    pinhole has the lens's size and what both eyes see in its middle; a wide one spans what the lenses see, at most
+    the borders of the image, across and down. Defaults: the resolution is that in the middle of the lenses; a
+    pinhole has the lens's size and is centred on the view of both eyes; a wide one spans what the lenses see, at most
     170 x 180 degrees (cylindrical: 120 x 180).
-    Raises StereovoxError for another model and for angles and sizes that cannot be.
+    Raises StereovoxError for another model and for impossible angles and sizes.
     """
     if model not in MODELS:
         raise StereovoxError(f"virtual camera: unknown model '{model}'{did_you_mean(model, MODELS)}")
@@ -179,13 +179,13 @@ def _pinhole(
 
 
 def _centre(eyes: Eyes) -> tuple[float, float]:
-    """Return the slopes x/z, y/z of the middle of both views; 0, 0 where the eyes see too far to the side."""
+    """Return the slopes x/z, y/z of the middle of both views; 0, 0 if the eyes see too far to the side."""
     slopes = []
     for lens, R in zip((eyes.left, eyes.right), eyes.rectifying_rotations(), strict=True):
         right, bottom = lens.width - 1, lens.height - 1
         rays = lens.directions([[0, 0], [right, 0], [0, bottom], [right, bottom]]) @ R
         slopes.append(rays[:, :2] / rays[:, 2:])
-        if not (rays[:, 2] > 0.2).all():  # NaN as well
+        if not (rays[:, 2] > 0.2).all():  # also NaN
             return 0.0, 0.0
     x, y = np.mean(slopes, axis=(0, 1))
     return float(x), float(y)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Virtual cameras for wide lenses: fisheye images are warped to them, so that rows of both eyes are the same planes.
+"""Virtual cameras for wide lenses. Fisheye images are warped to them so that rows of both eyes are the same planes.
 
-Both eyes lie on the x axis and every row of pixels is a plane through it, `(v - cv) * step_v` radians down from the
+Both eyes are on the x axis, and every row of pixels is a plane through it, `(v - cv) * step_v` radians down from the
 z axis. Depth is the distance from the x axis; see `stereovox.cameras.pinhole` for the ray convention.
 """
 
@@ -17,20 +17,20 @@ from stereovox.cameras.pinhole import STEREO, PinholeCamera, check_numbers
 from stereovox.errors import StereovoxError
 
 WIDEST_DEG = 88.0
-"""Rays within two degrees of the x axis have no depth: both eyes see the same there."""
+"""Rays within two degrees of the x axis have no depth: both eyes see the same point there."""
 WIDEST_BORDER_DEG = 93.0
-"""Limit for the outer border of a pixel, whose middle may not be that far off."""
+"""Limit for the outer border of a pixel; its centre is limited by WIDEST_DEG."""
 MIDDLE_DEG = 40.0
-"""Half the field of view of a wide camera's `middle`, at most."""
+"""Largest half field of view of a wide camera's `middle`."""
 FINEST_MIDDLE = 2400.0
-"""Its largest focal length in pixels: it only represents the view, no image is made with it."""
+"""Largest focal length of `middle` in pixels: it only represents the view; no image is made with it."""
 SEEN_DEG = 89.0
-"""Borders farther off count as this: depths from the x axis reach to infinity there."""
+"""Borders farther off count as this, because depths from the x axis become infinite there."""
 
 
 @dataclass(frozen=True)
 class SphericalCamera:
-    """An equirectangular camera: columns are even in the angle from the y-z plane (Valenti 2018, 4.2).
+    """An equirectangular camera: columns are equal steps of the angle from the y-z plane (Valenti 2018, 4.2).
 
     Attributes:
         width: Columns of the image.
@@ -96,7 +96,7 @@ class SphericalCamera:
         """Return the volume of the view.
 
         Args:
-            depth: Metres from the x axis, and along it, where the view ends.
+            depth: Metres from the x axis, and along it, at which the view ends.
 
         Returns:
             Cubic metres.
@@ -134,7 +134,7 @@ class SphericalCamera:
             aligned: Eye that the disparities belong to, `left` or `right`.
 
         Returns:
-            (height, width) float64 metres; NaN where the other eye would have to look back (90 degrees and more).
+            (height, width) float64 metres; NaN if the other eye's ray would point backwards (90 degrees and more).
         """
         here = self.angles()
         shift = np.asarray(disparity, float) * self.step_u
@@ -145,7 +145,7 @@ class SphericalCamera:
 
 @dataclass(frozen=True)
 class CylindricalCamera:
-    """A camera with columns like a pinhole's and rows even in angle, so that depth is `fx baseline / disparity`.
+    """A camera with a pinhole's columns and rows of equal angles, so that depth is `fx baseline / disparity`.
 
     The noise of its depth is the same function of depth in all directions, unlike a spherical camera's.
 
@@ -212,7 +212,7 @@ class CylindricalCamera:
         """Return the volume of the view.
 
         Args:
-            depth: Metres from the x axis, and along it, where the view ends.
+            depth: Metres from the x axis, and along it, at which the view ends.
 
         Returns:
             Cubic metres.
@@ -237,7 +237,7 @@ class CylindricalCamera:
 
         Args:
             disparity: (height, width) in pixels, above 0.
-            aligned: Eye that the disparities belong to, `left` or `right`; has no influence here.
+            aligned: Eye that the disparities belong to, `left` or `right`; ignored here.
 
         Returns:
             (height, width) float64 metres; NaN without a baseline.

@@ -26,9 +26,9 @@ from stereovox.files.safe_io import read_text, shown, toml_table
 MAX_CELLS = 8192
 """Most cells between the camera and the maximum range."""
 BLIND_RANGE = 0.3
-"""Metres within which most depth cameras see nothing."""
+"""Depth in metres below which most depth cameras measure nothing."""
 MAX_UNEQUAL = 16
-"""Largest ratio of two sides of a cell."""
+"""Largest allowed ratio between two sides of a cell."""
 
 
 class Config(Section):
@@ -38,26 +38,29 @@ class Config(Section):
         profile: Name of the profile that the settings come from.
         dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
         voxel_size: Side of a cell.
-        steps: Sides of a cell along x, y and z where they differ, at most 16-fold (Valenti 2018, 7.1); `voxel_size` is
-            then the largest. Pictures and exports are made in cubes of the smallest.
-        min_range: Least depth along the optical axis that counts.
-        max_range: Largest depth along the optical axis that counts.
+        steps: Sides of a cell along x, y and z if they differ, at most 16-fold (Valenti 2018, 7.1); `voxel_size` is
+            then the largest. Pictures and exports use cubes of the smallest side.
+        min_range: Smallest depth along the optical axis that is used.
+        max_range: Largest depth along the optical axis that is used.
         up: The axis of the world that points up (`z`, `-y`, ...); pictures and heights follow it.
-        up_direction: Unit vector that points up, where it lies between the axes; `up` is then the nearest axis.
-        levelled_from: Direction in the recording's world that is z in this map: `map --level` turned the poses by it.
-        blind_range: Depth in metres up to which a camera clears nothing, since it sees nothing that near. Not set:
-            0.3, but at most a tenth of max_range and at least min_range.
+        up_direction: Unit vector that points up, if no axis does so exactly; `up` is then the nearest axis.
+        levelled_from: Direction in the recording's world that is z in this map; set when `map --level` rotates the
+        poses.
+        blind_range: Depth in metres below which a camera clears no cells, because it measures nothing that near. Not
+            set: 0.3, but at most a tenth of max_range and at least min_range.
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
         device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
-            without a window, `max_memory`, `map.keep_times`, `map.keep_frames` or `sphere`. Without such a card it is
-            `cpu`, and a line says so.
+            without a window, `max_memory`, `map.keep_times`, `map.keep_frames` or `sphere`. Without such a card, `cpu`
+            is
+            used and a note is printed.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out if frames take longer. Not set:
             no limit.
         max_memory: Bytes that the cells may take, as a number or like "500 MB".
-        when_full: Frames that need more memory are refused (`refuse`); or the map is a window of that size round the
-            camera, which drops what leaves it (`roll`) or keeps it on disk (`spill`).
+        when_full: When memory runs out, refuse frames that need more (`refuse`), or keep a window of that size round
+        the
+            camera and drop what leaves it (`roll`) or keep it on disk (`spill`).
         trust: Which frames may change the map; see TrustConfig.
         pace: What is left out under `deadline_ms`; see PaceConfig.
         sensor: Inverse sensor model; see SensorConfig.
@@ -126,20 +129,20 @@ class Config(Section):
 
     @property
     def blind(self) -> float:
-        """Depth in metres up to which nothing is cleared."""
+        """Depth in metres below which nothing is cleared."""
         if self.blind_range is not None:
             return self.blind_range
         return min(max(self.min_range, BLIND_RANGE), max(self.min_range, 0.1 * self.max_range))
 
     @property
     def tilt(self) -> float:
-        """Angle in radians between the axis `up` and the direction that points up."""
+        """Angle in radians between the axis `up` and `up_direction`."""
         if self.up_direction is None:
             return 0.0
         return math.acos(min(1.0, self._along_up()))
 
     def _along_up(self) -> float:
-        """Return the part of `up_direction` along the axis `up`."""
+        """Return the component of `up_direction` along the axis `up`."""
         x, y, z = self.up_direction or (0.0, 0.0, 0.0)
         return {"x": x, "y": y, "z": z}[self.up[-1]] * (-1 if self.up.startswith("-") else 1)
 
@@ -172,7 +175,7 @@ class Config(Section):
                 value = self
                 for part in name.split("."):
                     value = getattr(value, part)
-                raise ValueError(f'{name} {value} cannot be had with device "cuda"; leave it out, or use device "cpu"')
+                raise ValueError(f'{name} {value} does not work with device "cuda"; leave it out, or use device "cpu"')
         return self
 
     @model_validator(mode="after")
@@ -211,7 +214,7 @@ def load_config(profile: str | Path | Config | Mapping[str, Any] = "default", **
         ConfigError: A profile cannot be read, or a setting is unknown, of the wrong type or out of range.
     """
     where = str(profile) if isinstance(profile, str | Path) else "config"
-    where = "" if where in profile_names() else f"{where}: "  # built-in ones are right: the override is wrong
+    where = "" if where in profile_names() else f"{where}: "  # built-in profiles are valid: the override is wrong
     settings = _as_settings(profile)
     for key, value in overrides.items():
         _put(settings, key, value)
@@ -254,7 +257,7 @@ def _read_profile(profile: str | Path) -> dict[str, Any]:
         if builtin.is_file():
             return {"profile": str(profile), **toml_table(builtin.read_text())}
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
+        why = getattr(error, "strerror", None) or "it is not text"
         raise ConfigError(f"{path}: cannot read the profile ({why}); give a readable TOML file") from None
     except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
@@ -291,7 +294,7 @@ def _one_line(error: ValidationError, where: str) -> str:
         message = f"give a list of {length} numbers, [{', '.join(letters[:length])}]"
     if first["type"].startswith("byte_size"):
         message = 'give bytes, or a size like "500 MB"'
-    if first["type"] == "string_pattern_mismatch":  # `up` alone has one
+    if first["type"] == "string_pattern_mismatch":  # only `up` has a pattern
         message = "give x, y, z, -x, -y or -z"
     name = ".".join(map(str, location)) or "settings"
     given = "" if isinstance(value, dict) or value == "" else f" {shown(value)}"
@@ -299,7 +302,7 @@ def _one_line(error: ValidationError, where: str) -> str:
 
 
 def _tuple_length(location: tuple[int | str, ...]) -> int:
-    """Return the length of the list that the setting at `location` takes; 0 where it takes none."""
+    """Return the length of the list that the setting at `location` takes; 0 if it takes no list."""
     model: Any = Config
     for name in location:
         field = getattr(model, "model_fields", {}).get(name)

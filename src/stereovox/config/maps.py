@@ -30,8 +30,8 @@ class SensorConfig(BaseModel):
 class RayConfig(Section):
     """How the integrators `ray` and `line` combine the rays of a frame.
 
-    update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). That
-        counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays next to
+    update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). The
+        latter counts pixels: a pole narrower than about a quarter of its cell is outvoted by the rays next to
         it and becomes free.
     """
 
@@ -41,8 +41,8 @@ class RayConfig(Section):
 class ProjectiveConfig(Section):
     """How the projective integrator counts hits.
 
-    full_share: a hit counts in full where at least this share of the cell's footprint in the image measures the cell,
-        below that by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
+    full_share: a hit counts in full if at least this share of the cell's footprint in the image measures the cell; a
+        smaller share counts as its square root, since a few pixels may be wrong; 0: every hit counts in full.
     """
 
     full_share: float = Field(0.0, ge=0, le=1)
@@ -53,19 +53,19 @@ class MapConfig(Section):
 
     cell: `int16` holds thousandths of log-odds, `int8` steps of 1/32 from -4 to 3.97; `uint8` is Chien's byte (2020,
     3.5): 127 unknown, 0 free, 255 occupied.
-    prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
-    a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
-    the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
-    confirm_hits: least number of frames that must hit an unknown cell before it is occupied; one frame raises it by
+    prior: probability that a cell is occupied before any evidence (l0 of Valenti 2018, Eq 6.2). Most cells a camera
+    sees are free, so a value well below one half gives calibrated probabilities. Give `prior` of the sensor model
+    `stereo` the same value. A cell that evidence has made more likely than `prior` is never free.
+    confirm_hits: smallest number of frames that must hit an unknown cell before it is occupied; one frame raises it by
         at most that fraction.
     keep_times: store when each cell got its last evidence (4 more bytes a cell).
     log_odds_min, log_odds_max: limits of a cell's log-odds.
     free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
-    forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
+    forget_s: a cell without evidence for this many seconds of the recording becomes unknown; needs `keep_times`.
     keep_frames: keep the depth images of all frames in the map, without loss, so that their poses can be corrected
         later (docs/corrections.md).
-    frames_budget: bytes that kept frames may take, as a number or like "500 MB"; where they need more, only those are
-        kept whose views differ most. Not set: no limit.
+    frames_budget: bytes that kept frames may take, as a number or like "500 MB"; if they need more, only the frames
+        with the most different views are kept. Not set: no limit.
     """
 
     cell: Literal["int16", "int8", "uint8"] = "int16"
@@ -94,14 +94,14 @@ class MapConfig(Section):
 class WindowConfig(Section):
     """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
 
-    size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
-    centre: the middle of a window that stays where it is, a fixed box (Valenti 2018, 7.1: the global map); without it
-        the window follows the camera (7.2: the local map), and only then the rest but `outside` has a meaning.
-    trigger: half width in metres of the box round the window's centre in which the camera moves freely; half a cell at
-        least.
-    lead_s: the centre runs ahead of the camera by so many seconds of its flight.
-    grow_s: the window is longer by so many seconds of flight along each axis.
-    largest: extents that it may grow to; not set: `size`.
+    size: extents along the world's axes in metres. Not set: the map is unbounded, and the other settings are ignored.
+    centre: the middle of a window that stays in place, a fixed box (Valenti 2018, 7.1: the global map). Not set:
+        the window follows the camera (7.2: the local map); the others except `outside` need this.
+    trigger: half width in metres of the box round the window's centre in which the camera moves freely; at least half a
+        cell.
+    lead_s: the centre runs ahead of the camera by this many seconds of motion.
+    grow_s: the window is longer by this many seconds of motion along each axis.
+    largest: largest extents that it may grow to; not set: `size`.
     outside: cells that leave are lost (`drop`), or kept in tiles on disk and restored when they return (`keep`).
     """
 

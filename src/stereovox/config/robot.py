@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a ground robot: scans out of depth images, 2-D grids, localisation, SLAM. Part of `config.Config`."""
+"""Settings of a ground robot: scans from depth images, 2-D grids, localisation, SLAM. Part of `config.Config`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stereovox.config.base import Section
 class ScanConfig(Section):
     """How a depth image becomes a scan (IST 2019, III-C).
 
-    method: `rows` takes the nearest of `rows` rows round the row that looks level, for level cameras; `cloud` takes the
+    method: `rows` takes the nearest of `rows` rows round the level row, for level cameras; `cloud` takes the
         nearest point between `heights`, for tilted ones.
-    rows: 1 is the middle row alone (IST 2019). off_level_deg: largest angle of that row off the level.
-    heights: lowest and highest metres above the floor that a robot occupies: what lies between them is an obstacle.
-    floor: height of a level floor in metres along `up`, from the world's origin. Not set: in a map in space the floor
-        is found at each place; for scans out of depth images it is 0.
-    angle_step_deg: width of a beam; not set: that of a pixel in the middle of the image.
+    rows: 1 is the middle row alone (IST 2019). off_level_deg: largest angle between that row and the horizon.
+    heights: lowest and highest metres above the floor that a robot occupies; anything between is an obstacle.
+    floor: height of a level floor in metres along `up`, from the world's origin. Not set: in 3-D maps the floor
+        is found at each place; for scans from depth images it is 0.
+    angle_step_deg: width of a beam; not set: the width of a pixel in the middle of the image.
     """
 
     method: Literal["rows", "cloud"] = "cloud"
@@ -39,13 +39,13 @@ class ScanConfig(Section):
 class GridConfig(Section):
     """How scans become a 2-D occupancy grid (IST 2019, II).
 
-    traversal: cells of a beam by `bresenham`'s line, or `exact`: every cell that it touches; other packages add theirs.
-    update: a cell changes `once` a scan (a hit beats a pass), or by `every` beam that crosses it (IST 2019).
-    thickness: metres behind the measured point that are occupied too (alpha of IST 2019, II-B); 0: its cell alone.
-    p_occupied, p_free: probability after one beam of the cell it ends in, and of a cell it passes, at even odds before
-        (OctoMap's numbers); see `prior`.
-    prior: probability that a cell is occupied before the first evidence on it.
-    max_tilt_deg: scans of a sensor that leans more than this are refused: its beams meet the floor.
+    traversal: cells of a beam: `bresenham`'s line, or `exact`: every cell that it touches; other packages can add more.
+    update: a cell changes `once` a scan (a hit beats a miss), or with `every` beam that crosses it (IST 2019).
+    thickness: metres behind the measured point that are occupied too (alpha of IST 2019, II-B); 0: only its cell.
+    p_occupied, p_free: probability, from even odds, after one beam that ends in a cell, and one that passes it
+        (OctoMap's values); see `prior`.
+    prior: probability that a cell is occupied before any evidence.
+    max_tilt_deg: scans of a sensor that leans more than this are refused, because its beams meet the floor.
     """
 
     traversal: str = "exact"
@@ -60,32 +60,32 @@ class GridConfig(Section):
 class AmclConfig(Section):
     """Adaptive Monte Carlo localisation (Thrun, Burgard and Fox 2005, chapters 5, 6 and 8).
 
-    particles_min, particles_max: least and largest number of particles.
-    kld_error, kld_z: enough particles are used that, up to the normal quantile `kld_z` (2.33: in 99 of 100 cases),
+    particles_min, particles_max: smallest and largest number of particles.
+    kld_error, kld_z: use enough particles that, up to the normal quantile `kld_z` (2.33: in 99 of 100 cases),
         they differ from the true distribution by at most `kld_error` (Fox 2003); kld_bin, kld_bin_deg: its bins, in
         metres and degrees, which also separate the clusters that the pose is taken from.
     alpha1 ... alpha4: noise of the odometry (table 5.6): variance of a turn by a turn, of a turn by a distance, of a
         distance by a distance, of a distance by a turn. 0.01 is a standard deviation of 10 %.
     update_min_d, update_min_a: update after moving this many metres or turning this many radians.
     resample_interval: updates between two resamplings.
-    model: `field` compares where beams end with the nearest obstacle (table 6.3); `beam` compares their lengths with
-        what the map lets them be (table 6.1), which takes longer and suits maps of all that the lidar sees.
-    max_beams: number of a scan's beams that are used. max_range: metres beyond which a beam has seen nothing; not set:
+    model: `field` compares beam ends with the nearest obstacle (table 6.3); `beam` compares ranges with
+        those expected from the map (table 6.1), which is slower and suits maps of everything the lidar sees.
+    max_beams: number of beams used per scan. max_range: metres beyond which a beam counts as no return; not set:
         the scan's own.
     trust: power of a scan's likelihood: 1 treats the beams as independent (as printed), 1 / max_beams as a single one.
-    z_hit, z_short, z_max, z_rand: shares of beams that end at what the map holds, before it, nowhere, and anywhere;
+    z_hit, z_short, z_max, z_rand: shares of beams that end at an obstacle of the map, before it, nowhere, and anywhere;
         only their proportions matter: `beam` divides them by their sum, which need not be 1 (it is not in ROS's amcl);
-        `field` knows z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
+        `field` uses z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
     field_distance: metres from an obstacle beyond which all places are equal.
-    beam_skip: leave out beams that most particles find in the open, once they agree with each other: people, and what
-        was moved.
-    beam_skip_distance: a beam fits a particle for which it ends within so many metres of an obstacle.
+    beam_skip: once the particles agree, leave out beams that most of them place in the open: people, and moved
+        objects.
+    beam_skip_distance: a beam fits a particle if it ends within this many metres of an obstacle.
     beam_skip_share: a beam is left out if it fits a smaller share of the particles.
-    beam_skip_most: all beams are used where a larger share of them would be left out.
-    alpha_slow, alpha_fast: decay rates of the long and the short average of the likelihood (table 8.3); where the
+    beam_skip_most: all beams are used if a larger share of them would be left out.
+    alpha_slow, alpha_fast: decay rates of the long and the short average of the likelihood (table 8.3); when the
         short one falls below the long one, random particles help to find the robot again. 0: never.
     recovery_least: a smaller share of random particles counts as chance, and none are drawn; 0: as printed.
-    candidates: random poses tried for each random particle, from which the scan chooses; 1: any, as printed.
+    candidates: random poses tried for each random particle, of which the scan selects one; 1: no selection, as printed.
     start_std: standard deviation of a given first pose: metres, metres, radians.
     """
 
@@ -137,24 +137,26 @@ class AmclConfig(Section):
 class SlamConfig(Section):
     """Simultaneous localisation and mapping from a 2-D lidar (`localize/slam/pipeline.py`).
 
-    voxel_size: side in metres of a cell of the map, and of the grid that scans are matched in.
-    max_range: metres up to which hits are matched; farther ones are too sparse to lie on a line.
-    sigma: metres that a hit may stand off a wall; beyond, it counts less and less (Geman and McClure).
-    odometry: how far the odometry's step between two scans may be off: metres (above 0), metres per metre, radians
-        (above 0), radians per radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching
-        knows better.
+    voxel_size: side in metres of a cell of the map, and of the grid used for scan matching.
+    max_range: metres up to which hits are matched; farther ones are too sparse to form a line.
+    sigma: metres that a hit may be off a wall; beyond, its weight falls (Geman and McClure).
+    odometry: possible error of the odometry's step between two scans: metres (above 0), metres per metre, radians
+        (above 0), radians per radian. The limits for turns are wide on purpose: odometry and lidar seldom share a
+        clock,
+        and matching is more accurate.
     keyframe_distance, keyframe_turn: metres and radians between the scans that make up the map.
     local_keyframes: a scan is matched with the map of this many recent keyframes.
-    submap_keyframes: keyframes of a submap, the unit that loops are closed with.
-    closure_path: least metres of path between two visits for a loop.
-    drift, drift_turn: drift that the search for loops allows on the path between: metres and radians per metre.
+    submap_keyframes: keyframes of a submap, the unit of loop closure.
+    closure_path: shortest path in metres between two visits for a loop.
+    drift, drift_turn: drift that the search for loops allows along that path: metres and radians per metre.
     closure_window, closure_window_turn: largest search window in metres and radians.
-    closure_score: least mean likelihood of the points (0 to 1) for a place to be one seen before.
-    closure_rival: no loop is closed where another place scores this share of the best score.
+    closure_score: smallest mean likelihood of the points (0 to 1) for recognising a place.
+    closure_rival: no loop is closed if another place reaches this share of the best score.
     closure_share: share of the points that must then lie on the earlier map's lines.
-    refine_rounds: rounds at the end in which all keyframes are matched with all that saw the same walls; 0 is fastest.
-    refine_distance: metres between keyframes that are matched with each other.
-    clear_far: whether a beam without a return clears the map up to `max_range`. Off, since many lidars report black and
+    refine_rounds: final rounds in which all keyframes are matched with all others that saw the same walls; 0 is
+    fastest.
+    refine_distance: largest distance in metres between keyframes that are matched with each other.
+    clear_far: let a beam without a return clear the map up to `max_range`. Off, since many lidars report black and
         dazzling objects in the same way.
     """
 
@@ -194,12 +196,12 @@ class SlamConfig(Section):
 class LoopsConfig(Section):
     """Loop closure in space (`loops/`).
 
-    drift: share of the way by which poses may be off, along each axis: over some metres it adds up, then grows with
-        the square root of the way.
-    drift_deg: degrees by which they may be turned after one metre; it grows with the square root of the way.
+    drift: share of the path length by which poses may be off, along each axis: it adds up over some metres, then grows
+        with the square root of the length.
+    drift_deg: degrees by which they may be turned after one metre; grows with the square root of the length.
     upright_deg: degrees by which the poses' up may be wrong; for poses levelled by gravity, as of a T265, a phone or a
         headset. Not set: up drifts like heading.
-    odometry_drift, odometry_drift_deg: the same as the first two of a second odometry, such as that of wheels.
+    odometry_drift, odometry_drift_deg: `drift` and `drift_deg` of a second odometry, such as wheel odometry.
     """
 
     drift: float = Field(0.015, gt=0, le=0.5)

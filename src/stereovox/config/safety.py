@@ -12,7 +12,7 @@ class TrustConfig(Section):
     """Which frames may change the map, and for how long it then counts as current (docs/safety.md).
 
     ordered: the stamps of each sensor must not go back; `false` for runs that repeat or reverse a recording.
-    clock_reset_s: a stamp that steps by more than this many seconds backwards is a clock that was reset.
+    clock_reset_s: a stamp more than this many seconds back counts as a clock reset.
     max_gap_s: a stamp more than this many seconds ahead counts as a clock reset, too.
     max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
     max_pose_off_s: seconds that a pose may be extrapolated.
@@ -20,13 +20,14 @@ class TrustConfig(Section):
     stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
     min_valid_share: share of the pixels that must have a depth or be too far; 0: one pixel is enough.
     min_surface_share: share of the depths that must lie on surfaces; 0: not checked.
-    max_unexposed_share: share of the pixels of a stereo pair's image that may be black, or saturated; 1: all.
-    frozen: refuse an image that is exactly the one before although the camera has moved.
-    max_disagreement: share of a frame's evidence on sure cells that may contradict the map, beyond what is usual for
+    max_unexposed_share: share of the pixels of a stereo image that may be black or saturated; 1: all.
+    frozen: refuse an image that repeats the previous one exactly although the camera has moved.
+    max_disagreement: share of a frame's evidence on certain cells that may contradict the map, beyond what is usual for
         its sensor; 1: not checked.
-    pose_error_m: occasional error of poses in metres; a frame may disagree by that over the size of a cell.
-    changed_s: least seconds of frames that disagree with the map after which a changed world is accepted, if they show
-        one; time alone is no evidence.
+    pose_error_m: occasional pose error in metres; a frame may disagree by this, relative to the size of a cell.
+    changed_s: shortest time in seconds for which frames must disagree with the map before a changed world is accepted,
+    if
+        they show one; time alone is no evidence.
     moved_s: seconds after which frames are accepted that would agree with the map from another pose; not set: never.
     """
 
@@ -58,8 +59,8 @@ class TrustConfig(Section):
 class PaceConfig(Section):
     """Quality levels for frames that take longer than `deadline_ms` (docs/safety.md).
 
-    near_share: share of the maximum range that the first step keeps. stride: pixels along each side that the second
-        step merges into one, on top of `depth.downsample`. The third step is to skip the frame.
+    near_share: share of the maximum range that the first level keeps. stride: pixels along each side that the second
+        level merges into one, on top of `depth.downsample`. The third level skips the frame.
     """
 
     near_share: float = Field(0.5, gt=0, le=1)

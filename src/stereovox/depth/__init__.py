@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame as delivered to a checked depth image."""
+"""From a raw frame to a checked depth image."""
 
 from stereovox.depth.pipeline import DepthPipeline
 from stereovox.depth.prepare import prepare

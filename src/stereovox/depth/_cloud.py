@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels for clouds: pick the rays that say something, find the rays next to some of them."""
+"""Kernels for clouds: select usable rays, find the nearest neighbours of some of them."""
 
 import numpy as np
 
@@ -8,11 +8,12 @@ from stereovox.kernels._jit import kernel
 
 @kernel
 def usable(points, origins, range_min, range_max, reach, ends, starts, hits):
-    """Write the rays of points (N, 3) that can be used one behind the other; return how many, and how many were finite.
+    """Write the usable rays of points (N, 3) without gaps; return their number, and the number of finite points.
 
-    origins: (N, 3) where each was measured from, (0, 3): all from the sensor. A point at 0, 0, 0 is none. Written, (N,
+    origins: (N, 3) where each was measured from, (0, 3): all from the sensor. A point at 0, 0, 0 is no point. Output,
+    (N,
     3) each and (N,): where rays end and begin, and whether at a surface: beyond `range_max` they end there without one,
-    and at least `reach` before the point, which may be as much nearer.
+    at least `reach` in front of the point, whose noise that allows for.
     """
     used = finite = 0
     moving = origins.shape[0] > 0
@@ -41,7 +42,7 @@ def usable(points, origins, range_min, range_max, reach, ends, starts, hits):
 
 @kernel
 def nearest(directions, asked, found):
-    """Fill `found` (Q,) with the column of the unit vector nearest to each asked one, which itself does not count.
+    """Fill `found` (Q,) with the column of the unit vector nearest to each of `asked`, other than itself.
 
     directions: (3, N) float32; asked: (Q,) int64 columns of it.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel that denoises a depth image: means over similar neighbours, and over lines that stand before a wall."""
+"""The kernel that denoises a depth image: means over similar neighbours, and over lines in front of a wall."""
 
 import numpy as np
 
@@ -8,15 +8,15 @@ from stereovox.kernels._jit import cell, kernel
 FAR = np.float32(np.inf)
 ZERO, ONE = np.float32(0), np.float32(1)
 SEGMENT = 32
-"""Pixels of a row that are skipped together where none of them is noisy."""
+"""Pixels of a row that are skipped together if none of them is noisy."""
 NONE = np.float32(-1e6)
-"""Inverse depth of a pixel without value: far from every other."""
+"""Inverse depth of a pixel without value: far from every real one."""
 COARSEST = np.float32(1e4)
-"""Bound for the noise of inverse depth, so that NONE stays far from everything."""
+"""Bound for the noise of inverse depth, so that NONE stays far from all values."""
 TAPS, SIDE = 2, 3
-"""Pixels of a line to each side of its middle, and distance of what must lie behind it; in steps of the first pass."""
+"""Pixels of a line on each side of its middle, and distance to its background; in steps of the first pass."""
 STANDS, WITHIN = np.float32(1.5), np.float32(2)
-"""Sigma by which each half of a line stands before both sides, and by which its middle may lie behind its mean."""
+"""Sigma by which each half of a line is in front of both sides, and by which its middle may be behind its mean."""
 THREE, FIFTH = np.float32(3), np.float32(0.2)
 
 
@@ -24,12 +24,12 @@ THREE, FIFTH = np.float32(3), np.float32(0.2)
 def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings, noisy, lines):
     """Replace every depth by a weighted mean over neighbours, in place; pixels without value stay as they are.
 
-    depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. One pass after another:
+    depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. For each pass:
     steps: (passes,) int64, ascending, distance of its four neighbours in pixels; fine: noise in metres up to which it
-    leaves a pixel unchanged; widths: difference in sigma at which a neighbour no longer counts; limit: cap of sigma,
-    metres. At last lines get their own means (`_lines`) if noise exceeds the last `fine`. low, high: results are
+    leaves a pixel unchanged; widths: difference in sigma at which a neighbour no longer counts. limit: cap of sigma,
+    metres. Finally lines get their own means (`_lines`) if noise exceeds the last `fine`. low, high: results are
     kept within these depths. rings: scratch (passes + 1, passes m + (SIDE + TAPS) steps[0] + 1, w + 2 m), m the
-    largest step and w rounded up to SEGMENT: inverse depths of the rows that are needed, measured and after each pass.
+    largest step and w rounded up to SEGMENT: inverse depths of the current rows, measured and after each pass.
     noisy: scratch (rows of rings, w / SEGMENT) uint8, whether any pixel of a segment takes part in a pass. lines:
     whether lines get their own means.
     """
@@ -64,9 +64,9 @@ def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings, noisy,
 
 @cell
 def _lines(rings, noisy, v, apart, margin, noise, fine, low, high, depths):
-    """Write depths of row v where a line of measured depths stands before the averaged ones at both its sides.
+    """Write depths of row v if a line of measured depths is in front of the averaged ones at both its sides.
 
-    A rod of a pixel or two has more neighbours on the wall than on itself, and was averaged into the wall.
+    A rod one or two pixels wide has more neighbours on the wall than on itself, and was averaged into the wall.
     """
     raw, averaged, rows = rings[0], rings[-1], rings.shape[1]
     near, far, side = np.uintp(apart), np.uintp(2 * apart), np.uintp(SIDE * apart)
@@ -94,7 +94,7 @@ def _lines(rings, noisy, v, apart, margin, noise, fine, low, high, depths):
 
 @cell
 def _any_line(measured, around, start, near, far, side, noise):
-    """Return whether any pixel of a segment may lie on a line that stands before both its sides."""
+    """Return whether any pixel of a segment may be on a line in front of both its sides."""
     number = np.int32(0)
     for i in range(np.uintp(SEGMENT)):
         u = start + i
@@ -112,7 +112,7 @@ def _before(line):
 
 @cell
 def _halves(measured, around, u, near, far, side):
-    """Return for upright, level and both slanting lines the sums of the halves, and what lies behind at the sides."""
+    """Return the sums of the halves of vertical, horizontal and both diagonal lines, and the depths at their sides."""
     a, b, c, d, e = measured
     f, g, h, i, j = around
     return (
@@ -125,14 +125,14 @@ def _halves(measured, around, u, near, far, side):
 
 @cell
 def _invert(depths, inverse, margin):
-    for u in range(np.uintp(depths.size)):  # unsigned, here and below: else each index is first compared with 0
+    for u in range(np.uintp(depths.size)):  # unsigned, here and below: otherwise each index is compared with 0
         d = depths[u]
         inverse[u + np.uintp(margin)] = ONE / d if (d > ZERO) & (d < FAR) else NONE
 
 
 @cell
 def _write(inverse, margin, noise, fine, low, high, depths):
-    """Write depths where they were to change."""
+    """Write the depths that this filter may change."""
     for u in range(np.uintp(depths.size)):
         d = depths[u]
         counts = (noise[0] + d * (noise[1] + d * noise[2]) > fine) & (d > ZERO) & (d < FAR)
@@ -141,7 +141,7 @@ def _write(inverse, margin, noise, fine, low, high, depths):
 
 @cell
 def _average(above, row, below, step, margin, noise, fine, wide, limit, out, noisy):
-    """Average the pixels of a row with those `step` next to them, and in the rows above and below; margins stay."""
+    """Average the pixels of a row with those `step` away in the row and in the rows above and below; skip margins."""
     for start in range(margin, np.uintp(row.size) - margin, np.uintp(SEGMENT)):
         takes_part = _any_noisy(row, start, noise, fine)
         noisy[_segment(start, margin)] = takes_part
@@ -183,7 +183,7 @@ def _sigma(c, noise):
 def _four(c, p, q, r, s, scale):
     """Return the weighted sum of four neighbours' differences from `c`, and the sum of their weights.
 
-    A weight is (1 - difference^2 scale)^4, at least 0: a neighbour at half the largest difference counts a third.
+    A weight is (1 - difference^2 scale)^4, at least 0: a neighbour at half the largest difference counts one third.
     """
     p, q, r, s = p - c, q - c, r - c, s - c
     f, g, h, k = _weight(p * p * scale), _weight(q * q * scale), _weight(r * r * scale), _weight(s * s * scale)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels on one depth image: metres and reasons, corrections, block minima, shorter range, quality."""
+"""Kernels on one depth image: metres and reasons, corrections, block minima, shortened range, quality."""
 
 import numpy as np
 
@@ -17,10 +17,11 @@ CHUNK = 4096
 def classify(raw, scale, min_range, max_range, none, infinite, given, far, depth_m, reason):
     """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
 
-    none: a raw value that means "no value" next to zero, negative ones and NaN (65535 in uint16 images). -inf is too
-    near. infinite: what +inf means: itself (too far), or NaN (unknown). given: the source's own reasons, which come
-    first; empty: it has none. far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or too
-    near, contradicts it.
+    none: a raw value that means "no value" in addition to zero, negative ones and NaN (65535 in uint16 images). -inf is
+    too near. infinite: what +inf means: itself (too far), or NaN (unknown). given: the source's own reasons, which take
+    precedence; empty: it has none. far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or
+    too
+    near, overrides it.
     """
     valid = np.int64(0)
     for start in range(0, raw.size, CHUNK):
@@ -35,7 +36,7 @@ def classify(raw, scale, min_range, max_range, none, infinite, given, far, depth
 
 @cell
 def _metres(raw, scale, min_range, max_range, none, infinite, depth_m):
-    for i in range(raw.size):  # single selects, no nested ones: those become branches and stop vectorisation
+    for i in range(raw.size):  # single selects: nested ones become branches, which prevent vectorisation
         value = np.float32(raw[i])
         d = value * scale
         d = NAN if (value == none) | ((d <= ZERO) & (d > NEAR)) else d
@@ -58,7 +59,7 @@ def _reasons(depth_m, reason):
 @cell
 def _reasons_given(given, far, depth_m, reason):
     valid = np.int32(0)
-    for i in range(given.size):  # in numbers as wide as depths: to spread what bytes compare to is slow
+    for i in range(given.size):  # numbers as wide as depths: widening the results of byte comparisons is slow
         d, theirs = depth_m[i], np.int32(given[i])
         own = _own(d)
         far_here = np.int32(UNKNOWN) if own == np.int32(VALID) else np.int32(far)
@@ -82,7 +83,7 @@ def _choose(condition, a, b):
 
 @cell
 def _own(d):
-    """Return the reason of a pixel by its REP 117 depth alone."""
+    """Return the reason of a pixel from its REP 117 depth alone."""
     why = np.int32(VALID) if d == d else np.int32(UNKNOWN)
     why = np.int32(TOO_NEAR) if d == NEAR else why
     return np.int32(TOO_FAR) if d == FAR else why
@@ -90,7 +91,7 @@ def _own(d):
 
 @kernel
 def quadratics(s, q, x, y, depth_m):
-    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN: that is no depth; infinities stay.
+    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN if not positive; infinities stay.
 
     s, q: (6,) float32, coefficients of 1, x, y, x^2, x y, y^2. x, y: slopes of columns and rows.
     """
@@ -129,7 +130,7 @@ def block_minimum(depth_m, reason, n, row, out_depth, out_reason):
     for i in range(out_depth.shape[0]):
         first, last = i * n, min((i + 1) * n, height)
         row[:] = FAR
-        for v in range(first, last):  # whole rows, so that the compiler can take many columns at once
+        for v in range(first, last):  # whole rows, so that the compiler can process many columns at once
             for u in range(width):
                 d = depth_m[v, u]
                 row[u] = d if (d > ZERO) & (d < row[u]) else row[u]
@@ -161,7 +162,7 @@ def _why(reason, first, last, left, right):
 
 @kernel
 def shorten(depth_m, reason, valid_to, far_from, out_depth, out_reason):
-    """Copy flat REP 117 depths and reasons; beyond `valid_to` there is no value, from `far_from` on it is too far."""
+    """Copy flat REP 117 depths and reasons; values beyond `valid_to` are dropped, those from `far_from` on too far."""
     for i in range(depth_m.size):
         d, why = depth_m[i], np.int32(reason[i])
         why = np.int32(UNMATCHED) if d > valid_to else why
@@ -174,11 +175,11 @@ def shorten(depth_m, reason, valid_to, far_from, out_depth, out_reason):
 
 @kernel
 def count(depth_m, step, noise, slack, counts):
-    """Count pixels into `counts` (4,) int64: sampled ones; those with a depth or too far; those whose neighbours in the
-    row have a depth as well; and those of them on a surface with both.
+    """Count pixels into `counts` (4,) int64: sampled ones; those with a depth or too far; those with a depth whose
+    neighbours in the row have one too; and those of the last that are on a surface with both.
 
     depth_m: (height, width) float32, REP 117; every `step`-th row is sampled. noise: (3,) s0, s1, s2 of the range
-    noise, times what a second difference may be in sigma. slack: share of the inverse depth that it may be on top.
+    noise, times the largest second difference in sigma. slack: share of the inverse depth that is allowed in addition.
     """
     looked, informative, compared, even = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for v in range(0, depth_m.shape[0], step):

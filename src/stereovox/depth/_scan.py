@@ -14,7 +14,7 @@ ZERO, HALF, TINY, INF = np.float32(0), np.float32(0.5), np.float32(1e-12), np.fl
 def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, fan, beams, scratch):
     """Fill `beams` from a REP 117 depth image (height, width) and its reasons.
 
-    columns, rows: `camera.rays()`; edge_columns (width + 1,), edge_rows (height + 1, 2): those of the pixels' borders.
+    columns, rows: `camera.rays()`; edge_columns (width + 1,), edge_rows (height + 1, 2): rays of the pixels' borders.
     turn: (3, 3) maps the optical frame into the scan's: forward, left, up. band, fan, beams: see scan.py.
     scratch: (9, width + 1) float32.
     """
@@ -22,7 +22,7 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
     before, after, hits, starts, ends = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     firsts, lasts = scratch[5, :width].view(np.int32), scratch[6, :width].view(np.int32)
     slopes, blinds = scratch[7], scratch[8]
-    above = band.camera > band.high  # the steepest rays meet the band first, and they are in the lowest rows
+    above = band.camera > band.high  # the steepest rays reach the band first, and they are in the lowest rows
     within = (band.camera >= band.low) & (band.camera <= band.high)
     _places(edge_columns, edge_rows[height if above else 0], turn, fan, before)
     for i in range(height):
@@ -40,7 +40,7 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
 
 @cell
 def _places(columns, row, turn, fan, places):
-    """Fill the places in the fan of the rays of one row."""
+    """Fill the positions in the fan of the rays of one row."""
     down, ahead = row[0], row[1]
     f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
     for u in range(columns.size):
@@ -50,7 +50,7 @@ def _places(columns, row, turn, fan, places):
 
 @cell
 def _cover(before, after, fan, firsts, lasts):
-    """Fill the first and last beam of each pixel: those whose middle it covers, else the one its own middle is in."""
+    """Fill the first and last beam of each pixel: those whose centre it covers, else the one that contains its own."""
     for u in range(firsts.size):
         low = min(min(before[u], before[u + 1]), min(after[u], after[u + 1]))
         high = max(max(before[u], before[u + 1]), max(after[u], after[u + 1]))
@@ -66,11 +66,12 @@ def _cover(before, after, fan, firsts, lasts):
 def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, blinds):
     """Fill the hit of each ray of a row and the start and end of its free part in the band, in metres along the floor.
 
-    Also its slope (rise per metre along the floor), and the distance up to which nothing is measured on it.
+    Also its slope (rise per metre along the floor), and the distance up to which it measures nothing.
 
-    The hit is -inf where something too near may be in the band, inf if there is none. The floor right in front
-    of the camera is too near as well, but no obstacle: rays that would meet it there are ignored. An ignored ray, one
-    that is too steep and one that looks back are free up to 0.
+    The hit is -inf if something too near may be in the band, inf if there is none. The floor right in front
+    of the camera is too near as well, but no obstacle: rays that would meet it there are ignored. Rays that are
+    ignored,
+    too steep or point backwards are free up to 0.
     """
     down, ahead = row[0], row[1]
     f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
@@ -99,7 +100,7 @@ def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, b
 
 @cell
 def _reach(firsts, lasts, slopes, blinds, beams):
-    """Add the directions of the rays of a row, whatever they met."""
+    """Add the directions of the rays of a row, whatever they hit."""
     for u in range(firsts.size):
         for b in range(firsts[u], lasts[u] + 1):
             beams.lowest[b] = min(beams.lowest[b], slopes[u])
@@ -108,7 +109,7 @@ def _reach(firsts, lasts, slopes, blinds, beams):
 
 @cell
 def _add(firsts, lasts, hits, ends, beams):
-    """Add the rays of a row that are in the band from the camera on."""
+    """Add the rays of a row that start inside the band."""
     for u in range(firsts.size):
         b = firsts[u]
         beams.hit[b] = min(beams.hit[b], hits[u])

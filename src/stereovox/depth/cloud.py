@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check clouds, and straighten those of a sensor that moved while it measured."""
+"""Check clouds, and correct the motion distortion of clouds from a moving sensor."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sensors.model import REACH_SIGMA
 
 SOME = 4096
-"""Points of a cloud by which its unit is checked."""
+"""Points of a cloud that are sampled to check its unit."""
 STEPS, STEP_S = 64, 0.002
-"""Poses of a moving sensor during one cloud, and most seconds between two: it moves a few centimetres meanwhile."""
+"""Poses of a moving sensor during one cloud, and most seconds between two: it moves a few centimetres in that time."""
 LONGEST_S, FARTHEST_S = 10.0, 1e6
-"""Most seconds from the first to the last point of a cloud, and from its stamp; beyond, numbers are no times."""
+"""Most seconds from the first to the last point of a cloud, and from its stamp; larger numbers are not times."""
 
 
 def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
-    """Return the rays of a cloud that say something.
+    """Return the usable rays of a cloud.
 
-    Points without value, and those nearer than the lidar's or the settings' minimum range, are left out: their rays
-    clear nothing. Rays beyond the lidar's own maximum range end there, with no surface, and at least four sigma before
-    their point.
+    Points without value, and points nearer than the lidar's or the settings' minimum range, are left out: their rays
+    clear nothing. Rays beyond the lidar's own maximum range end there without a surface, and at least four sigma in
+    front
+    of their point.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
     `bad_shape`, `too_many_points`, `bad_units`, `no_valid_point`, `too_few_values`, `no_surfaces`, and as `rigid_pose`.
     """
@@ -41,7 +42,7 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     points, clear = _points(cloud, "points"), _points(cloud, "clear")
     origins = None if cloud.origins is None else _points(cloud, "origins")
     if origins is not None and len(origins) != len(points):
-        detail = f"{len(origins)} origins of {len(points)} points; give one for each"
+        detail = f"{len(origins)} origins for {len(points)} points; give one for each"
         raise FrameRefused("bad_shape", f"{name_of(cloud)}: {detail}")
     clear = clear[np.isfinite(clear).all(axis=1)]
     room = len(points) + len(clear)
@@ -53,7 +54,7 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     used, finite = usable(points, none, nearest, farthest, reach, ends, starts, hits)
     if not used and not len(clear):
         found = f"{len(points)} points, {finite} of them finite"
-        raise FrameRefused("no_valid_point", f"{name_of(cloud)}: not one ray can be used ({found}); is it covered?")
+        raise FrameRefused("no_valid_point", f"{name_of(cloud)}: no ray can be used ({found}); is it covered?")
     rays = used + len(clear)
     ends[used:rays], starts[used:rays], hits[used:rays] = clear, 0.0, False
     begin = None if origins is None else starts[:rays]
@@ -69,7 +70,7 @@ def _check_unit(
     clear: NDArray[np.float64],
     config: Config,
 ) -> None:
-    """Raise FrameRefused `bad_units` where some of a cloud's points, or of its free rays, are not in metres."""
+    """Raise FrameRefused `bad_units` if a cloud's points, or its free rays, are not in metres."""
     for ends, starts in ((points, origins), (clear, None)):
         some = slice(None, None, max(1, len(ends) // SOME))
         arms = ends[some] if starts is None else ends[some] - starts[some]
@@ -78,24 +79,24 @@ def _check_unit(
 
 
 def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transform]) -> Cloud:
-    """Return a cloud as it had been measured at once, at its stamp, from where its sensor really was.
+    """Return a cloud as if measured all at once, at its stamp, corrected for the motion of its sensor.
 
     Args:
-        cloud: Its points are where the sensor saw them when it measured each.
+        cloud: Each of its points is in the sensor's frame at the time it was measured.
         times_s: (N,) seconds from `stamp_ns` at which each was measured.
-        pose_at: Returns T_world_sensor (4, 4) at a time in nanoseconds; FrameRefused if it is not known.
+        pose_at: Returns T_world_sensor (4, 4) at a time in nanoseconds; raises FrameRefused if it is unknown.
 
     Returns:
         The cloud with its points in the sensor's frame at `stamp_ns`, and with `origins`. Points with a time that is
-        not finite are then not finite.
+        not finite become not finite.
 
     Raises:
-        FrameRefused: The pose at some time of the sweep is not known, or there is not one time for each point, or they
-            are no times.
+        FrameRefused: The pose at some time of the sweep is unknown, or the number of times differs from the number of
+            points, or they are not times.
     """
     times = np.asarray(times_s, float)
     if times.shape != (len(cloud.points),):
-        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {times.shape} times of {len(cloud.points)} points")
+        raise FrameRefused("bad_shape", f"{name_of(cloud)}: {times.shape} times for {len(cloud.points)} points")
     known = np.isfinite(times)
     if not known.any():
         return replace(cloud, points=np.full((len(times), 3), np.nan))
@@ -117,7 +118,7 @@ def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transfor
 
 
 def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
-    """Return points (N, 3) of a field as float64; none if it is None."""
+    """Return points (N, 3) of a field as float64; (0, 3) if it is None."""
     given = getattr(cloud, field)
     if given is None:
         return np.empty((0, 3))
@@ -126,5 +127,7 @@ def _points(cloud: Cloud, field: str) -> NDArray[np.float64]:
     if given.ndim != 2 or given.shape[1] != 3:
         raise FrameRefused("bad_shape", f"{name_of(cloud)}: {field} are {given.shape}; give (N, 3) metres")
     if len(given) > MAX_POINTS:
-        raise FrameRefused("too_many_points", f"{name_of(cloud)}: {len(given)} {field}; at most {MAX_POINTS} are taken")
+        raise FrameRefused(
+            "too_many_points", f"{name_of(cloud)}: {len(given)} {field}; at most {MAX_POINTS} are accepted"
+        )
     return np.ascontiguousarray(given, float)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth pipeline, from frame to depth image: match, check, clean, gather on the spherical grid."""
+"""The depth pipeline from frame to depth image: match, check, clean, and gather on the spherical grid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereovox.frame.validate import validate_fields
 
 
 class DepthPipeline:
-    """Turns frames into depth images, as configured."""
+    """Turns frames into depth images as configured."""
 
     def __init__(self, config: Config):
         self._config = config
@@ -24,13 +24,14 @@ class DepthPipeline:
     def matched(self, frame: AnyFrame) -> Frame:
         """Return a stereo frame with its depth, any other frame unchanged.
 
-        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for clouds and anything but a frame.
+        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for clouds and anything that is not a
+        frame.
         """
         if isinstance(frame, Frame):
             return frame  # `prepare` validates its fields
         if isinstance(frame, Cloud):
             validate_fields(frame, Cloud)
-            detail = "is a cloud, no image: it can be mapped with given poses, not tracked"
+            detail = "is a cloud, not an image: it can be mapped with given poses, but not tracked"
             raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
         validate_fields(frame, StereoFrame, Frame)
         assert isinstance(frame, StereoFrame)
@@ -42,12 +43,12 @@ class DepthPipeline:
         return through_sphere(self.checked(frame), self._config)
 
     def checked(self, frame: Frame) -> DepthImage:
-        """Return as `image` what was measured, before it is gathered on a spherical grid."""
+        """Return what `image` returns, but before it is gathered on a spherical grid."""
         image = prepare(frame, self._config)
         check_depth(image, frame, self._config)
         return image
 
     @cached_property
     def _stereo(self) -> StereoDepth:
-        """Made for the first stereo frame: other recordings need no OpenCV."""
+        """Created for the first stereo frame: other recordings need no OpenCV."""
         return StereoDepth(self._config.stereo)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prepare a depth image: check the frame, convert to metres, give each pixel without a value its reason, denoise.
+"""Prepare a depth image: check the frame, convert to metres, assign a reason to each pixel without a value, denoise.
 
-Also the steps by themselves: depth correction, denoising, block minima, a shorter range.
+Each step is also a function: depth correction, denoising, block minima, a shorter range.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ SATURATED = 65535
 NO_REASONS = for_kernels(np.empty(0, np.uint8))
 """Stand-in for frames without reasons, so that the kernel is compiled before the first frame with some."""
 SMALLEST = 1e-30
-"""Smallest metres per unit of a depth image that float32 can multiply with."""
+"""Smallest scale in metres per unit that float32 can multiply with."""
 MAX_REASON = max(Reason)
 FINE = 0.15
 """Noise below this share of a cell does not thicken a surface noticeably."""
 WORTH = 0.5
-"""Where no noise exceeds this share of a cell, raw depth maps as well; in the demo at 0.2 m even slightly better."""
+"""If no noise exceeds this share of a cell, raw depth maps equally well; in the demo at 0.2 m slightly better."""
 STEPS = np.array([1, 2, 4])
 """Distance of the neighbours in pixels, pass by pass."""
 FROM = np.array([1, 1, 3])
-"""A pixel takes part in a pass where its noise is more than this many times FINE cells."""
+"""A pixel takes part in a pass if its noise is more than this many times FINE cells."""
 WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
 """A neighbour counts less the more it differs, and not at all beyond this many sigma."""
 APART = 2.5
-"""Pixels so many `noise.correlation_px` apart count as independent: their errors have a correlation of 0.2."""
+"""Pixels this many `noise.correlation_px` apart count as independent: their errors have a correlation of 0.2."""
 FARTHEST_APART = 4
-"""Most by which steps are stretched for that: the last then reaches 16 pixels. Farther off are other things."""
+"""Largest factor on the steps for that: the last then reaches 16 pixels. Farther pixels show other objects."""
 LIMIT = 1.3
-"""Cap of sigma in cells: what the map can separate is not mixed, however noisy the camera."""
+"""Cap of sigma in cells: surfaces that the map can separate are not mixed, however noisy the camera."""
 
 
 def prepare(frame: Frame, config: Config) -> DepthImage:
-    """Return the frame's depth image in metres, corrected where its camera has a `correction`.
+    """Return the frame's depth image in metres, corrected if its camera has a `correction`.
 
-    A pixel is UNKNOWN where the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
-    [min_range, max_range], TOO_NEAR also if it is -inf. The source's own reason, where it has one, comes first; but
-    its TOO_FAR only where neither a depth at the pixel nor the frame's `farthest` contradicts it. `depth.far` sets
+    A pixel is UNKNOWN if the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
+    [min_range, max_range], TOO_NEAR also if it is -inf. The source's own reason, if any, takes precedence; but
+    its TOO_FAR only if neither a depth at the pixel nor the frame's `farthest` contradicts it. `depth.far` sets
     which sources of "too far" count.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
     `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
@@ -68,7 +68,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
         check_unit(frame, _sample_depths(frame), config)
     if not usable and not (reason == Reason.TOO_FAR).any():
         cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
-        raise FrameRefused("no_valid_depth", f"{name_of(frame)}: not one pixel has a valid depth; {cure}")
+        raise FrameRefused("no_valid_depth", f"{name_of(frame)}: no pixel has a valid depth; {cure}")
     denoise(depth_m, frame.camera, config)
     image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, int(frame.stamp_ns))
     return downsample(image, config.depth.downsample)
@@ -103,24 +103,26 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     A sigma filter (Lee 1983) whose weights (1 - (difference / (k sigma))^2)^4 fall smoothly, in passes with holes
     ("a trous", Dammertz 2010): with the next neighbours to the left and right, above and below, then with those 2
     pixels away, then 4. So few neighbours reach far, and stereo noise, which is correlated over about the matching
-    window, is removed as well. It works on inverse depth, in which stereo noise is the same everywhere and a plane is
-    linear, so a mean over symmetric neighbours is true to it. sigma is that of the noise model, configured or from
-    the camera. Errors that are alike over more than the next pixel (`noise.correlation_px`) do not average out there:
-    all steps are stretched until the neighbours are independent looks, as the filter takes them to be.
-    A pixel takes part in no more passes than it needs: it is left unchanged where sigma(depth) is at most
-    FINE cells, and by the last pass up to three times that. So near surfaces keep every detail. Nothing is done where
+    window, is removed too. It works on inverse depth, in which stereo noise is uniform and a plane is
+    linear, so a mean over symmetric neighbours has no bias. sigma is from the noise model, configured or from
+    the camera. Errors that are correlated over more than the next pixel (`noise.correlation_px`) do not average out
+    there:
+    all steps are stretched until the neighbours are independent, as the filter assumes.
+    A pixel takes part in no more passes than it needs: it is left unchanged if sigma(depth) is at most
+    FINE cells, and by the last pass up to three times that. So near surfaces keep every detail. Nothing is done if
     even the noise at the maximum range is less than WORTH cells.
 
     Averaging row and column together keeps thin objects: a pole has similar neighbours along the column while its row
     shows the wall behind, and a wire the other way round; in later passes the remaining noise no longer hides the step.
     Averaging rows first would remove a pole two sigma in front of its wall.
 
-    Even so a rod of a pixel or two, two to three sigma before its wall, is mostly averaged into it, and what looks past
-    it then clears its cells. So at last a pixel takes the mean of a line of five measured pixels (upright, level or
-    slanting) where that is nearer, and both halves of the line stand 1.5 sigma before what is on both sides: three
+    Even so, a rod one or two pixels wide, two to three sigma before its wall, is mostly averaged into it, and rays past
+    it then clear its cells. So finally a pixel takes the mean of a line of five measured pixels (vertical, horizontal
+    or
+    diagonal) if that is nearer, and both halves of the line are 1.5 sigma in front of both sides: three
     pixels on, after all passes. Noise alone does so at one pixel in a thousand. This is left out up to three times
-    FINE cells of noise, as the last pass is, and unless `depth.keep_lines` is set: registration, where the few pixels
-    that noise puts in front matter more than thin things, goes without.
+    FINE cells of noise, as the last pass is, and unless `depth.keep_lines` is set. Registration goes without it:
+    there, the few pixels that noise puts in front matter more than thin objects.
 
     Limitation: a step of less than about two sigma is smoothed over some pixels.
     """
@@ -134,9 +136,9 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
 def downsample(image: DepthImage, n: int) -> DepthImage:
     """Return the image of block minima and its camera; n = 1 returns the image itself.
 
-    A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
-    MASKED where one is, else UNMATCHED where one is, else UNKNOWN. Blocks at the right and lower border may be cut.
-    Raises ConfigError for a wide camera, FrameRefused `bad_camera` where larger pixels make no valid pinhole camera.
+    A block without any valid pixel is TOO_NEAR if one of its pixels is, TOO_FAR only if all of them are, else
+    MASKED if one is, else UNMATCHED if one is, else UNKNOWN. Blocks at the right and lower border may be cut.
+    Raises ConfigError for a wide camera, FrameRefused `bad_camera` if larger pixels do not form a valid pinhole camera.
     """
     if n == 1:
         return image
@@ -155,7 +157,7 @@ def downsample(image: DepthImage, n: int) -> DepthImage:
 def shortened(image: DepthImage, valid_to: float, far_from: float) -> DepthImage:
     """Return the image with depths up to `valid_to` metres; farther than `far_from` is TOO_FAR.
 
-    Between the two a pixel is UNMATCHED: its noise could have put it there, so nothing may be cleared along it.
+    Pixels between the two are UNMATCHED: their noise could have put them there, so nothing may be cleared along them.
     """
     depth_m, reason = np.empty_like(image.depth_m), np.empty_like(image.reason)
     given, made = (image.depth_m, image.reason), (depth_m, reason)
@@ -172,11 +174,11 @@ def _check_image(frame: Frame) -> None:
         raise FrameRefused("bad_dtype", f"{name}: depth is {kind}; give a uint16, float32 or float64 array")
     if depth.shape != (camera.height, camera.width):
         wanted = f"({camera.height}, {camera.width})"
-        raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
+        raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera has {wanted}")
     if depth.dtype.kind == "u" and isnan(frame.depth_scale):
         cure = "give metres per unit, depth_scale=0.001 for millimetres"
         raise FrameRefused("bad_scale", f"{name}: depth is {depth.dtype} and has no depth_scale; {cure}")
-    if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well
+    if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # also NaN
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
     if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):
         given = f"{np.shape(frame.reason)} {getattr(frame.reason, 'dtype', type(frame.reason).__name__)}"
@@ -193,7 +195,7 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
     camera = frame.camera
     infinite = np.float32(np.inf if config.depth.far == "infinite" else np.nan)
-    if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which hold for true depths
+    if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which apply to true depths
         raw, scale, none = corrected(raw, scale, none, infinite, camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
@@ -209,7 +211,7 @@ def corrected(
     """Return the corrected depth (height * width,) in metres, float32, of a flat raw image; NaN: no value.
 
     scale: metres per unit; none, infinite: as in `_images.classify`; infinities stay. A pixel whose corrected
-    depth is not positive has no value, which clears nothing.
+    depth is not positive has no value and clears nothing.
     """
     depth_m = np.empty(raw.size, np.float32)
     _images.classify(
@@ -221,7 +223,7 @@ def corrected(
 
 
 def _sample_depths(frame: Frame) -> NDArray[np.float64]:
-    """Return a sample of a frame's depths (N,) in metres, without those that its source marks as no value."""
+    """Return a sample of a frame's depths (N,) in metres, without those that its source marks as invalid."""
     rows, columns = (slice(n // 128, None, max(1, n // 64)) for n in frame.depth.shape)
     raw = np.asarray(frame.depth)[rows, columns]
     none = raw == SATURATED if raw.dtype == np.uint16 else np.zeros(raw.shape, bool)
@@ -243,11 +245,11 @@ def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: C
 
 
 def stretched(correlation_px: float) -> int:
-    """Return by how much neighbours must be farther apart for errors that are alike over so many pixels; 1: not."""
+    """Return the factor on the distance of neighbours for errors that are correlated over this many pixels."""
     return min(max(1, round(APART * correlation_px)), FARTHEST_APART)
 
 
 @lru_cache
 def _numbers(noise: RangeNoise, fine: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return s0, s1, s2 (3,) of the noise, and for each pass the noise in metres that it leaves."""
+    """Return s0, s1, s2 (3,) of the noise, and for each pass the noise in metres that it leaves alone."""
     return np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)

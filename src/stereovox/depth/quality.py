@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plausibility of images, clouds and scans: enough values, on surfaces, in metres; neither black nor saturated.
 
-Chien 2020, 5.1, asks for such a filter of overexposed images and miscalculated depth. Whether an image agrees with the
-map and the frames before it is checked by the gate.
+Chien 2020, 5.1, asks for such a filter of overexposed images and miscalculated depth. The gate checks whether an image
+agrees with the map and the frames before it.
 """
 
 from __future__ import annotations
@@ -24,48 +24,48 @@ from stereovox.sensors.noise import RangeNoise
 ROWS = 16
 """Rows of an image that are sampled."""
 BEND_SIGMA, BEND_SLACK = 3 * sqrt(6), 0.02
-"""On a surface the second difference of inverse depth along a row is at most three of its standard deviations (that of
-a depth times the root of 1 + 4 + 1), and 2 % of the inverse depth on top: surfaces are not all plane."""
+"""On a surface, the second difference of inverse depth along a row is at most three of its standard deviations (sigma
+of a depth times the root of 1 + 4 + 1), plus 2 % of the inverse depth, since surfaces are not all planar."""
 FEW = 100
 """Fewer pixels with a depth on both sides prove neither surfaces nor their absence."""
 BLACK, WHITE = 5, 250
-"""Grey up to which a pixel is black, and from which it is saturated."""
+"""Grey value up to which a pixel is black, and from which it is saturated."""
 FAR_RANGES, FAR_M = 60, 300.0
 """Median depth, in maximum ranges and in metres, beyond which the unit must be wrong."""
 NEAR_RANGE, NEAR_M = 0.1, 0.01
 """Median depth, as a share of the minimum range and in metres, below which the unit must be wrong."""
 SPARSE = 0.05
-"""The unit is checked where a smaller share of the pixels has a depth within the range."""
+"""The unit is checked if a smaller share of the pixels has a depth within the range."""
 FAR_LIDAR_M = 300.0
-"""Median range, and at least twice the maximum range of the map, beyond which those of a lidar are not in metres. Half
-of what a lidar on a vehicle measures is nearer; a room in millimetres is farther. One in feet or in centimetres may be
+"""Median range, and at least twice the maximum range of the map, beyond which a lidar's ranges are not in metres. Half
+of the points of a lidar on a vehicle are nearer; a room in millimetres is farther. Ranges in feet or centimetres may be
 nearer, and cannot be recognised."""
 SAMPLE, ASKED, ALL = 4096, 256, 1 << 18
-"""Rays of a cloud that are looked at, those of them whose neighbours are sought, and rays among which they are sought
-once more before a cloud is refused: leaves of a thicket are alike only from one ray to the very next."""
+"""Rays of a cloud in the sample, those of them whose neighbours are sought, and rays that are searched for neighbours
+once more before a cloud is refused: leaves of a thicket are similar only between directly adjacent rays."""
 FEW_RAYS, FEW_BEAMS = 200, 50
-"""So few rays of a cloud, or beams of a scan, prove neither surfaces nor their absence."""
+"""Fewer rays of a cloud, or beams of a scan, prove neither surfaces nor their absence."""
 ALIKE, ALIKE_SIGMA = 0.03, 3 * sqrt(2)
-"""Ranges of neighbours differ on a surface by no more than their distance across, this share of the range, and so many
-standard deviations of a range."""
+"""Ranges of neighbours on a surface differ by no more than their distance across, this share of the range, and this
+many standard deviations of a range."""
 TINY_M, BEAM_SIGMA_M = 1e-6, 0.03
-"""Length of a ray whose length is 0, and the standard deviation assumed of a 2-D lidar's ranges."""
+"""Length used for a ray of length 0, and the assumed standard deviation of a 2-D lidar's ranges."""
 
 
 def check_depth(image: DepthImage, frame: Frame, config: Config) -> None:
     """Raise FrameRefused if the depth image of `frame` shows no surfaces: `too_few_values`, `no_surfaces`."""
     looked, informative, compared, even = counted(image, config)
-    if informative < config.trust.min_valid_share * looked:  # of the sampled rows; now count all
+    if informative < config.trust.min_valid_share * looked:  # in the sampled rows; now count all
         _check_share(image, frame, config.trust.min_valid_share)
     if even < config.trust.min_surface_share * compared and compared >= FEW:
-        detail = f"{even / compared:.0%} of the depths lie on surfaces"
+        detail = f"{even / compared:.0%} of the depths are on surfaces"
         limit = f"trust.min_surface_share {config.trust.min_surface_share:g}"
         raise FrameRefused("no_surfaces", f"{name_of(frame)}: {detail} ({limit}); check camera and driver")
 
 
 def counted(image: DepthImage, config: Config) -> tuple[int, int, int, int]:
-    """Return four numbers of pixels in the sampled rows: all, and those with a depth or too far; those with a depth
-    between two others, and those of them that lie on a surface with both, within the range noise.
+    """Return four numbers of pixels in the sampled rows: all; those with a depth or too far; those with a depth
+    between two others; and those of the last that are on a surface with both, within the range noise.
     """
     noise, counts = RangeNoise.of(config.noise, image.camera), np.empty(4, np.int64)
     allowed = np.array([BEND_SIGMA * noise.s0, BEND_SIGMA * noise.s1, BEND_SIGMA * noise.s2], np.float32)
@@ -79,7 +79,7 @@ def _check_share(image: DepthImage, frame: Frame, least: float) -> None:
     informative, pixels = number[Reason.VALID] + number[Reason.TOO_FAR], number.sum() - number[Reason.MASKED]
     if informative < least * pixels:
         detail = (
-            f"{informative} of {pixels} pixels say something (trust.min_valid_share {least:g}); is the view blocked?"
+            f"{informative} of {pixels} pixels have information (trust.min_valid_share {least:g}); is the view blocked?"
         )
         raise FrameRefused("too_few_values", f"{name_of(frame)}: {detail}")
 
@@ -103,12 +103,12 @@ def check_unit_of_rays(seen: Cloud | Scan, lengths_m: NDArray[np.floating], conf
 
 
 def _wrong_unit(lengths_m: NDArray[np.floating], farthest_m: float, config: Config) -> tuple[float, str] | None:
-    """Return the median of lengths (N,) if it cannot be in metres, and whether it is `beyond` or `below` that."""
+    """Return the median of lengths (N,) if it cannot be in metres, and whether it is `beyond` or `below` the limit."""
     known = lengths_m[np.isfinite(lengths_m) & (lengths_m > 0)]
     if not known.size:
         return None
     known.sort()
-    median = float(known[(known.size - 1) // 2] + known[known.size // 2]) / 2  # np.median takes ten times as long
+    median = float(known[(known.size - 1) // 2] + known[known.size // 2]) / 2  # np.median is ten times as slow
     if median > farthest_m:
         return median, "beyond"
     return (median, "below") if median < min(NEAR_RANGE * config.min_range, NEAR_M) else None
@@ -133,7 +133,7 @@ def checked_scan(scan: Scan, config: Config) -> Scan:
 
 
 def check_scan(scan: Scan, config: Config) -> None:
-    """Raise FrameRefused if a validated scan of a lidar cannot be true.
+    """Raise FrameRefused if a validated scan of a lidar is implausible.
 
     The reason is `bad_units`, `no_valid_range`, `too_few_values`, or `no_surfaces`.
     """
@@ -142,7 +142,7 @@ def check_scan(scan: Scan, config: Config) -> None:
     hit = (ranges >= scan.range_min) & (ranges > 0) & (ranges <= scan.range_max) & np.isfinite(ranges)
     says = hit | (ranges == np.inf)
     clear = scan.clear
-    if clear is not None and clear.shape == ranges.shape and clear.dtype.kind in "fiu":  # else it is refused later
+    if clear is not None and clear.shape == ranges.shape and clear.dtype.kind in "fiu":  # otherwise refused later
         says |= clear > 0
     number = int(np.count_nonzero(says))
     if not number:
@@ -156,26 +156,28 @@ def check_scan(scan: Scan, config: Config) -> None:
 
 
 def _check_number(seen: Cloud | Scan, number: int, of: int, what: str, config: Config) -> None:
-    """Raise FrameRefused `too_few_values` where `number` of so many points or beams are too few to say something."""
+    """Raise FrameRefused `too_few_values` if `number` of the `of` points or beams are too few."""
     least = config.trust.min_valid_share
     if number < least * of:
-        detail = f"{number} of {of} {what} say something (trust.min_valid_share {least:g}); is the view blocked?"
+        detail = f"{number} of {of} {what} have information (trust.min_valid_share {least:g}); is the view blocked?"
         raise FrameRefused("too_few_values", f"{name_of(seen)}: {detail}")
 
 
 def _check_alike(seen: Cloud | Scan, alike: Callable[[int], float], config: Config) -> None:
-    """Raise FrameRefused `no_surfaces` if too few ranges are like those next to them.
+    """Raise FrameRefused `no_surfaces` if too few ranges are similar to their neighbours.
 
-    alike: returns the share of them, 0 to 1, among so many rays.
+    alike: returns the share of them, 0 to 1, among a given number of rays.
     """
     least = config.trust.min_surface_share
     if alike(SAMPLE) < least and (share := alike(ALL)) < least:
-        detail = f"{max(share, 0):.0%} of its ranges are like those next to them (trust.min_surface_share {least:g})"
+        detail = (
+            f"{max(share, 0):.0%} of its ranges are similar to their neighbours (trust.min_surface_share {least:g})"
+        )
         raise FrameRefused("no_surfaces", f"{name_of(seen)}: {detail}; check sensor and driver")
 
 
 def _alike_of(checked: CheckedCloud, most: int) -> float:
-    """Return `_alike` for some points of a cloud and the nearest direction among at most about `most` others."""
+    """Return `_alike` for some points of a cloud, with neighbours from at most about `most` points."""
     at = np.flatnonzero(checked.hits)
     at = at[:: max(1, len(at) // most)]
     if len(at) < FEW_RAYS:
@@ -197,13 +199,13 @@ def _alike(
     gap: NDArray[np.floating],
     sigma: float,
 ) -> float:
-    """Return how much ranges (N,) are like those in nearly the same direction: 1 wholly, 0 as any two of them.
+    """Return how similar ranges (N,) are to those in nearly the same direction: 1 fully, 0 as any two of them.
 
     one, next_to_it: (Q,) rows of ranges that are next to each other; gap: (Q,) radians between them; sigma: metres.
 
-    A pair counts fully where it may lie on one surface that is seen under at least 45 degrees. Otherwise it counts by
-    how few of all ranges are as near to the one as its neighbour is: half of them on average where ranges are random,
-    whatever their distribution and however the rays lie; hardly any on walls, on the ground, and in a bush.
+    A pair counts fully if both may be on one surface that is seen under at least 45 degrees. Otherwise it counts by
+    the share of all ranges that are farther from the one than its neighbour is: half on average if ranges are random,
+    whatever their distribution and the directions of the rays; nearly all on walls, on the ground, and in a bush.
     """
     logs = np.log(ranges)
     off = np.abs(logs[one] - logs[next_to_it])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduce a depth image to the scan that a 2-D lidar would take in the camera's place (IST 2019, III-C)."""
+"""Reduce a depth image to the scan of a 2-D lidar at the camera's position (IST 2019, III-C)."""
 
 from __future__ import annotations
 
@@ -27,32 +27,37 @@ FLOOR_NOISE = 1.25
 SPARSE = 4
 """Step between the rows and columns that are searched for that depth."""
 DEEP, MOST_DEEP = 0.3, 0.1
-"""No more than such a share of what a camera sees lies so many metres below the floor: stairs that lead down."""
+"""At most this share of the visible points is this many metres below the floor, as on stairs that lead down."""
 WHOLE = 1e-3
-"""A beam that is free up to `range_max` except this share of it is free up to it: rays are not exactly level."""
+"""A beam that is free up to `range_max` less this share counts as free up to it, since rays are not exactly level."""
 
 
 def scan_of(image: DepthImage, config: Config) -> Scan:
     """Return the scan of a depth image; the floor is level, at `scan.floor`, or else at 0.
 
-    The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
-    the floor. The mount on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows` takes
-    the nearest of a few rows round the one that looks level (the job of depthimage_to_laserscan), `cloud` the nearest
-    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose middle it covers,
-    or else to the one in which its own middle is. Any camera will do; rays that look back or are steeper than 80
-    degrees say nothing.
+    The scan's sensor is at the camera, upright, with its x axis along the camera's viewing direction; ranges are metres
+    along the floor. The mount on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows`
+    takes
+    the nearest of a few rows round the level one (the job of depthimage_to_laserscan), `cloud` the nearest
+    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose centre it covers,
+    or else to the one that contains its own centre. Any camera will do; rays that point backwards or are steeper than
+    80
+    degrees are ignored.
 
-    A beam is -inf, and free nowhere, where something is too near that may be within the heights; else it has the range
-    of its nearest point; else +inf where it is free all the way to `max_range`, else NaN. `clear` says how far: up to
-    where some ray of the beam was seen to be free *within the heights*. Where all its rays end or leave the heights,
-    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen,
-    and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
+    A beam is -inf, and free nowhere, if something too near may be within the heights; else it has the range
+    of its nearest point; else +inf if it is free all the way to `max_range`, else NaN. `clear` is the distance up to
+    which some ray of the beam was seen to be free *within the heights*. Beyond the end of all its rays, or their exit
+    from
+    the heights, it is unknown. One ray is enough, as with a lidar: an object lower than all rays of its beam is not
+    seen,
+    and its place counts as free. Points beyond `max_range` along the floor are dropped: their rays are free up to
+    there.
 
-    Raises FrameRefused: `camera_tilted` if no row looks level (method `rows`), `camera_vertical` if the camera
-    looks straight up or down, `heights_not_seen` if no ray meets the heights; ConfigError if z is not up.
+    Raises FrameRefused: `camera_tilted` if no row is level (method `rows`), `camera_vertical` if the camera
+    points straight up or down, `heights_not_seen` if no ray meets the heights; ConfigError if z is not up.
     """
     if config.up.removeprefix("+") != "z":
-        raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
+        raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; rotate the poses, and set up=z")
     turn, yaw = levelled(image)
     rays, rows, heights = rays_of(image.camera), slice(0, image.camera.height), config.scan.heights
     if config.scan.method == "rows":
@@ -86,7 +91,7 @@ class Directions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays through pixels' middles and borders, as `camera.rays()`: columns (n,), rows (m, 2), of borders one more."""
+    """Rays through pixels' centres and borders, as `camera.rays()`: columns (n,), rows (m, 2); one more for borders."""
 
     columns: NDArray[np.float32]
     rows: NDArray[np.float32]
@@ -116,11 +121,11 @@ class Band(NamedTuple):
     far: np.float32
     range_max: np.float32
     steepest: np.float32  # rise per metre along the floor from which a ray is ignored
-    floor: np.float32  # depth up to which TOO_NEAR may be the floor; 0 where the floor is an obstacle
+    floor: np.float32  # depth up to which TOO_NEAR may be the floor; 0 if the floor is an obstacle
 
 
 class Fan(NamedTuple):
-    """A ray `angle` radians to the left falls at angle * per_radian + offset; beam b spans b - 0.5 to b + 0.5."""
+    """A ray `angle` radians to the left is at angle * per_radian + offset; beam b spans b - 0.5 to b + 0.5."""
 
     per_radian: np.float32
     offset: np.float32
@@ -130,10 +135,10 @@ class Fan(NamedTuple):
 class Beams(NamedTuple):
     """State of the beams, (N,) arrays as the kernel writes them, in metres along the floor."""
 
-    hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can tell
+    hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can measure
     start: NDArray[np.float32]  # free from here
     end: NDArray[np.float32]  # up to here; 0: nowhere
-    lowest: NDArray[np.float32]  # rise of its lowest ray for a metre along the floor; inf: it has no ray
+    lowest: NDArray[np.float32]  # rise of its lowest ray per metre along the floor; inf: it has no ray
     unmeasured: NDArray[np.float32]  # nothing is measured nearer than this
 
 
@@ -147,14 +152,14 @@ def rays_of(camera: VirtualCamera) -> Rays:
 def levelled(image: DepthImage) -> tuple[NDArray[np.float64], float]:
     """Return the rotation (3, 3) from the optical frame to forward, left, up, and the yaw of forward in the world.
 
-    Raises FrameRefused `camera_vertical` if the camera looks so steeply that there is no forward.
+    Raises FrameRefused `camera_vertical` if the camera points so steeply that there is no forward direction.
     """
     R = image.T_world_sensor[:3, :3]
     ahead = R[:, 2]
     if np.hypot(ahead[0], ahead[1]) < np.cos(np.radians(STEEPEST_DEG)):
         raise FrameRefused(
             "camera_vertical",
-            f"{name(image)}: the camera looks straight {'up' if ahead[2] > 0 else 'down'}, where no scan can be;"
+            f"{name(image)}: the camera points straight {'up' if ahead[2] > 0 else 'down'}, which gives no scan;"
             " check its pose (z of the world must point up)",
         )
     yaw = float(np.arctan2(ahead[1], ahead[0]))
@@ -163,9 +168,9 @@ def levelled(image: DepthImage) -> tuple[NDArray[np.float64], float]:
 
 
 def level_rows(image: DepthImage, rays: Rays, turn: NDArray[np.float64], number: int, off_level_deg: float) -> slice:
-    """Return `number` rows round the one that looks level, fewer at the image's border.
+    """Return `number` rows round the level one, fewer at the image's border.
 
-    Raises FrameRefused `camera_tilted` if a ray of that row is more than `off_level_deg` off the level.
+    Raises FrameRefused `camera_tilted` if a ray of that row is more than `off_level_deg` off the horizon.
     """
     forward, _, up = turn @ np.column_stack([np.zeros(len(rays.rows)), rays.rows]).T
     middle = int(np.argmin(np.where(forward > 0, np.abs(np.arctan2(up, forward)), np.inf)))
@@ -174,7 +179,7 @@ def level_rows(image: DepthImage, rays: Rays, turn: NDArray[np.float64], number:
     if off > off_level_deg:
         raise FrameRefused(
             "camera_tilted",
-            f"{name(image)}: the camera is tilted: its most level row is {off:.1f} deg off the level, more than"
+            f"{name(image)}: the camera is tilted: its most level row is {off:.1f} deg off the horizon, more than"
             f" scan.off_level_deg {off_level_deg:g}; set scan.method=cloud",
         )
     first = middle - (number - 1) // 2
@@ -184,7 +189,7 @@ def level_rows(image: DepthImage, rays: Rays, turn: NDArray[np.float64], number:
 def directions(rays: Rays, turn: NDArray[np.float64], step: float) -> tuple[Directions, float]:
     """Return the beams of `step` radians that a view covers, and the cosine of its steepest angle.
 
-    A view that looks straight down or up somewhere has beams all over the half circle ahead, and no more.
+    A view that includes straight down or up has beams over the whole half circle ahead, and no more.
     """
     forward, left, up = rays.border(turn)
     floor_m = np.hypot(forward, left)
@@ -201,7 +206,7 @@ def directions(rays: Rays, turn: NDArray[np.float64], step: float) -> tuple[Dire
 def check_heights(
     image: DepthImage, rays: Rays, turn: NDArray[np.float64], heights: tuple[float, float], far: float, at: float
 ) -> None:
-    """Raise FrameRefused `heights_not_seen` if no ray is within `heights` before `far` metres of depth.
+    """Raise FrameRefused `heights_not_seen` if no ray is within `heights` up to `far` metres of depth.
 
     at: height of the camera above the floor in metres.
     """
@@ -220,7 +225,7 @@ def check_heights(
 def check_floor(image: DepthImage, config: Config) -> None:
     """Raise FrameRefused `below_floor` if an image shows that the floor is not at `scan.floor`, or at 0.
 
-    The camera, or much of what it sees, then lies deeper, as in a world that begins at the camera: obstacles would lie
+    The camera, or much of what it sees, is then below it, as in a world that begins at the camera: obstacles would be
     below the heights that count, and their places would be free.
     """
     at = float(image.T_world_sensor[2, 3]) - (config.scan.floor or 0.0)
@@ -234,7 +239,7 @@ def check_floor(image: DepthImage, config: Config) -> None:
         raise FrameRefused(
             "below_floor",
             f"{name(image)}: the camera is {at:.2f} m above the floor of the settings, and {share:.0%} of what it sees"
-            " lies below that floor; set scan.floor to the floor's height in the world of the poses, in metres",
+            " is below that floor; set scan.floor to the floor's height in the world of the poses, in metres",
         )
 
 
@@ -244,9 +249,9 @@ def pixel_angle(camera: VirtualCamera) -> float:
 
 
 def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
-    """Return how far each beam is blind to objects on the floor, (N,) metres along it; inf: everywhere.
+    """Return the distance up to which each beam cannot see objects on the floor, (N,) metres along it; inf: everywhere.
 
-    Up to there its lowest ray is still above the lowest height, or nothing is measured so near to the camera.
+    Up to there its lowest ray is still above the lowest height, or the camera measures nothing so near.
     """
     drop = max(band.camera - band.low, np.float32(0))
     with np.errstate(divide="ignore"):
@@ -255,9 +260,9 @@ def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
 
 
 def nearest(image: DepthImage) -> float:
-    """Return about the least depth in metres in the image (its 1st percentile); 0 if it has none.
+    """Return roughly the smallest depth in metres in the image (its 1st percentile); 0 if it has none.
 
-    The camera's own nearest depth may be larger than `min_range`, without being reported.
+    The camera's real minimum depth may exceed `min_range` without being reported.
     """
     some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
     known = image.depth_m[some][image.reason[some] == Reason.VALID]
@@ -291,7 +296,8 @@ def _gathered(
 def _to_ranges(
     beams: Beams, range_max: float, closest: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the ranges of the beams (REP 117), up to where they are free, and from where on, at least `closest`."""
+    """Return the ranges of the beams (REP 117), and the end and start of their free part, which is at least
+    `closest`."""
     clear = np.minimum(beams.end, beams.hit).clip(min=0)
     clear[clear <= beams.start] = 0
     whole = (clear >= range_max * (1 - WHOLE)) & (beams.start == 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a path holds: a map, recording, bag, cloud, image, poses or calibration; and the commands that use it."""
+"""The contents of a path: a map, recording, bag, cloud, image, poses or calibration; and the commands that use it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ KINDS = (
     "stereovox.descriptions.files:describe_image",
     "stereovox.descriptions.files:describe_points",
 )
-"""Asked in this order; each returns None for what is not of its kind."""
+"""Tried in this order; each returns None for paths of another kind."""
 BY_THEMSELVES, MOST_FILES = 4, 50
-"""How many of them, from the first on, are of files that need no others; and files of a folder that are looked at."""
+"""How many of the first kinds are single files; and how many files of a folder are checked."""
 UNKNOWN = "is of no known kind, by name or content; what can be read: docs/recordings.md and docs/formats.md"
 
 
 def describe(path: str | os.PathLike[str]) -> Description:
-    """Find out what a path holds and what to do with it; a recording is looked at, not read whole.
+    """Find out what a path contains and how to use it; a recording is sampled, not read whole.
 
     Args:
-        path: A folder or file, also with options behind a `?`, or a simulation (`sim:room`).
+        path: A folder or file, optionally with options behind a `?`, or a simulation (`sim:room`).
 
     Returns:
-        What it holds.
+        Its description.
 
     Raises:
-        StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
-            is missing, and the cure.
+        StereovoxError: The path is missing, or no command can use it: one line with its apparent kind, the missing
+            part, and the cure.
     """
     from stereovox.opening import file_cure, open_source
 
@@ -50,7 +50,7 @@ def describe(path: str | os.PathLike[str]) -> Description:
     if os.path.isfile(text):
         raise SourceError(f"{shortened(text)}: {file_cure(text) or UNKNOWN}")
     try:
-        open_source(text)  # which says what is missing
+        open_source(text)  # its error names the missing part
     except SourceError:
         found = _within(text)
         if found is None:
@@ -60,7 +60,7 @@ def describe(path: str | os.PathLike[str]) -> Description:
 
 
 def _known(text: str, kinds: Sequence[str]) -> Description | None:
-    """Return what a path holds if that is of one of these kinds."""
+    """Describe a path if it is of one of these kinds."""
     for name in kinds:
         module, _, function = name.partition(":")
         known: Callable[[str], Description | None] = getattr(import_module(module), function)
@@ -71,17 +71,17 @@ def _known(text: str, kinds: Sequence[str]) -> Description | None:
 
 
 def _within(folder: str) -> Description | None:
-    """Return what the one file of a folder holds that commands use by itself; raises SourceError for several."""
+    """Describe the single file of a folder that commands can use by itself; raises SourceError for several."""
     if not os.path.isdir(folder) or any(entry.is_dir() for entry in os.scandir(folder)):
         return None
     files = sorted(entry.path for entry in os.scandir(folder) if entry.is_file() and not _is_image(entry.name))
     found = {file: one for file in files[:MOST_FILES] if (one := _known(file, KINDS[:BY_THEMSELVES])) is not None}
     if len(found) > 1:
         see = f"stereovox info {shlex.quote(next(iter(found)))}"
-        raise SourceError(f"{shortened(folder)}: no recording, but {len(found)} files; see each: {see}")
+        raise SourceError(f"{shortened(folder)}: not a recording, but {len(found)} files; see each: {see}")
     return next(iter(found.values()), None)
 
 
 def _is_image(name: str) -> bool:
-    """Return whether a file may be the image of a floor's map, which is described by the other file of it."""
+    """Return whether a file may be the image of a floor's map, which is described by its .yaml."""
     return name.lower().endswith((".pgm", ".png", ".bmp"))

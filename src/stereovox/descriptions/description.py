@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A description of what a path holds, and the words, names and command lines that go into it."""
+"""The description of a path, and the words, names and command lines in it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from stereovox.files.safe_io import FLOOR_READABLE
 
 @dataclass(frozen=True)
 class Description:
-    """What a path holds.
+    """The description of a path.
 
     Attributes:
         kind: `map`, `floor map`, `recording`, `bag`, `robot`, `cloud`, `settings`, `calibration`, `poses`, `depth
             image` or `picture`.
-        lines: Lines for people.
-        facts: The same as numbers and texts, as `stereovox info --json` prints them.
-        commands: Command lines that use it, the likely one first.
+        lines: Text lines for people.
+        facts: The same as numbers and strings, as `stereovox info --json` prints them.
+        commands: Command lines that use it, the most likely first.
     """
 
     kind: str
@@ -50,29 +50,29 @@ def many(number: int, thing: str) -> str:
 
 
 def thousands(number: Any) -> str:
-    """Format a whole number with commas: 1,234,567."""
+    """Format an integer with commas: 1,234,567."""
     return f"{number:,}"
 
 
 def metres(numbers: Any) -> str:
-    """Format lengths along axes: `1.9 x 0.6 x 1.0 m`, or `3 x 98 x 6 mm` where all are short."""
+    """Format lengths along axes: `1.9 x 0.6 x 1.0 m`, or `3 x 98 x 6 mm` if all are short."""
     if max(numbers) < 0.1:
         return " x ".join(f"{1000 * number:.0f}" for number in numbers) + " mm"
     return " x ".join(f"{number:.1f}" if number < 10 else f"{number:.0f}" for number in numbers) + " m"
 
 
 def map_name(source: str, ending: str = ".svox") -> str:
-    """Return the usual name of the map of a recording: `kitchen.svox`, and `room.svox` for `sim:room`."""
+    """Return the default name of a recording's map: `kitchen.svox`, and `room.svox` for `sim:room`."""
     place = source if os.path.exists(source) else source.partition("?")[0]
     kind, colon, rest = place.partition(":")
     if colon and not os.path.exists(place):
         return f"{rest or kind}{ending}"
-    name = os.path.basename(os.path.realpath(place))  # which bears loops of links
+    name = os.path.basename(os.path.realpath(place))  # tolerates loops of links
     packed = name.lower().endswith((".bz2", ".gz"))
     return f"{Path(Path(name).stem if packed else name).stem or 'map'}{ending}"
 
 
 def picture_name(path: str) -> str:
-    """Return the usual name of the picture of a map; the image of a floor's map may have the shorter name."""
+    """Return the default name of a map's picture; the image of a floor's map may have the shorter name."""
     place = Path(os.path.realpath(path))
     return f"{place.stem}{'-picture' if place.suffix.lower() in FLOOR_READABLE else ''}.png"

@@ -18,7 +18,7 @@ PICTURE_SUFFIXES = (".jpg", ".jpeg", ".bmp", ".webp", ".ppm", ".pgm")
 IMAGE_SUFFIXES = (*SUFFIXES, *PICTURE_SUFFIXES)
 TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".xml", ".csv", ".log", ".tum", ".freiburg")
 LOOSE = (".txt", ".csv", ".bin", ".npz")
-"""Endings of clouds and cells that are those of many other things too."""
+"""Endings of clouds and cells that many other files share."""
 SEE = "what each may hold: docs/recordings.md, docs/formats.md"
 MAX_TEXT = 1 << 24
 """Largest file in bytes that is tried as poses or a calibration."""
@@ -27,7 +27,7 @@ USUAL_UNITS = 0.001, 1 / 5000
 
 
 def describe_cloud(path: str) -> Description | None:
-    """Describe a cloud, mesh or map of another program that can be imported; None for anything else.
+    """Describe a cloud, mesh or another program's map that can be imported; None for anything else.
 
     Raises MapFileError for a damaged one.
     """
@@ -39,17 +39,17 @@ def describe_cloud(path: str) -> Description | None:
 
 
 def describe_points(path: str) -> Description | None:
-    """Describe a file that may hold anything and does hold points or cells; None for anything else."""
+    """Describe points or cells in a file whose ending fits many formats; None for anything else."""
     if not os.path.isfile(path) or Path(path).suffix.lower() not in LOOSE:
         return None
     try:
         return _cloud(path)
     except StereovoxError:
-        raise SourceError(f"{path}: holds no poses, calibration, image or points that can be read; {SEE}") from None
+        raise SourceError(f"{path}: holds no readable poses, calibration, image or points; {SEE}") from None
 
 
 def _cloud(path: str) -> Description:
-    """Describe what an import of the file gives; raises MapFileError."""
+    """Describe the result of importing the file; raises MapFileError."""
     from stereovox.formats import import_map
 
     out = f"{Path(path).stem}.svox"
@@ -68,7 +68,7 @@ def _cloud(path: str) -> Description:
 def describe_settings(path: str) -> Description | None:
     """Describe a TOML file of stereovox: settings, a camera, a rig or a pair; None for anything else.
 
-    Raises StereovoxError for one with a mistake.
+    Raises StereovoxError if it has a mistake.
     """
     if Path(path).suffix.lower() != ".toml" or not os.path.isfile(path):
         return None
@@ -96,7 +96,7 @@ def describe_settings(path: str) -> Description | None:
 
 
 def describe_calibration(path: str) -> Description | None:
-    """Describe the calibration of a camera or stereo pair that another program wrote; None for anything else."""
+    """Describe another program's calibration of a camera or stereo pair; None for anything else."""
     if not _is_text(path):
         return None
     from stereovox.sources.calibration.calibration_files import import_rig
@@ -187,7 +187,7 @@ def describe_image(path: str) -> Description | None:
     if valid.size:
         low, middle, high = np.percentile(valid, [5, 50, 95]).tolist()
         facts["values"] = [low, middle, high]
-        lines.append(f"90 % of the values lie from {low:.6g} to {high:.6g}; half of them are below {middle:.6g}")
+        lines.append(f"90 % of the values are from {low:.6g} to {high:.6g}; half of them are below {middle:.6g}")
         lines.append(_unit_line(middle, depth.dtype == np.uint16))
     lines.append("one image makes no map: put the images into depth/ with a file of poses next to it")
     folder = os.path.dirname(os.path.abspath(path))
@@ -195,7 +195,7 @@ def describe_image(path: str) -> Description | None:
 
 
 def _unit_line(middle: float, whole: bool) -> str:
-    """Say what the unit may be, by the middle value."""
+    """Return a line on the likely unit, judged by the middle value."""
     if not whole and 0.1 < middle < 60:
         return "the unit is likely metres"
     fitting = [
@@ -203,11 +203,11 @@ def _unit_line(middle: float, whole: bool) -> str:
         for unit in USUAL_UNITS
         if 0.2 < middle * unit < 20
     ]
-    return f"the unit may be {' or '.join(fitting)}" if fitting else "the unit is none of the usual ones"
+    return f"the unit may be {' or '.join(fitting)}" if fitting else "the unit is not a usual one"
 
 
 def _picture(path: str, refused: str) -> Description:
-    """Describe a picture that was refused as a depth image; raises SourceError if it is none."""
+    """Describe a picture that was refused as a depth image; raises SourceError if it is not a picture."""
     from PIL import Image, UnidentifiedImageError
 
     try:

@@ -23,11 +23,11 @@ from stereovox.maps.record.health import FULL
 from stereovox.view.grid import known_bounds
 
 ALWAYS_PRINTED = ("profile", "voxel_size", "integrator", "max_range")
-"""Settings that are printed in any case."""
+"""Settings that are always printed."""
 
 
 def describe_map(path: str) -> Description | None:
-    """Describe a folder of a map in space; None for anything else. Raises MapFileError for a damaged one."""
+    """Describe a folder of a map in space; None for anything else. Raises MapFileError if it is damaged."""
     if not is_map(path):
         _refuse_manifest(Path(path))
         return None
@@ -62,15 +62,15 @@ def describe_map(path: str) -> Description | None:
 
 
 def _refuse_manifest(path: Path) -> None:
-    """Raise MapFileError if a map is named by its manifest, which has numbers as calibrations have them."""
+    """Raise MapFileError if a map is named by its manifest, whose numbers resemble a calibration's."""
     if path.name == MANIFEST and path.is_file() and FORMAT.encode() in read_part(path, 0, 100):
         raise MapFileError(
-            f"{path}: is a file of a map, which is the folder; type: {command_line('info', path.parent)}"
+            f"{path}: is a file inside a map, which is the folder; type: {command_line('info', path.parent)}"
         )
 
 
 def _boxes(voxel_map: VoxelMap) -> dict[str, Any] | None:
-    """Return how a map in boxes is cut; None for others."""
+    """Return the boxes and levels of a boxed map; None for others."""
     if not isinstance(voxel_map, BoxedMap):
         return None
     manifest = voxel_map.manifest
@@ -80,9 +80,9 @@ def _boxes(voxel_map: VoxelMap) -> dict[str, Any] | None:
 
 
 def describe_floor(path: str) -> Description | None:
-    """Describe a floor map in map_server files, with the keys of a map in space where they apply; None for others.
+    """Describe a floor map in map_server files, with the keys of a map in space if they apply; None for others.
 
-    Raises MapFileError for a damaged one.
+    Raises MapFileError if it is damaged.
     """
     if Path(path).suffix.lower() not in FLOOR_READABLE or not _has_metadata(Path(path)):
         return None
@@ -134,14 +134,14 @@ def _lines(result: dict[str, Any]) -> list[str]:
         (x0, y0, z0), (x1, y1, z1) = result["bounds"]
         lines.append(f"from ({x0:g}, {y0:g}, {z0:g}) to ({x1:g}, {y1:g}, {z1:g}) m")
     lines.append(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative")))
-    window = "" if settings["window"]["size"] is None else ", besides what its window reserved"
+    window = "" if settings["window"]["size"] is None else ", in addition to its window's reserve"
     loaded = "in memory once loaded" + window
     frames = f"{result['frames']} frames ({result['frames_refused']} refused), " if of_frames else ""
     lines.append(f"{frames}{size(result['memory_bytes'])} {loaded}")
     if boxes := result["boxes"]:
         lines.append(
             f"in {thousands(boxes['number'])} boxes of {max(boxes['metres']):g} m, {boxes['levels'] + 1} levels of "
-            f"detail, {size(boxes['bytes'])}: only those that are asked for are read"
+            f"detail, {size(boxes['bytes'])}: only requested ones are read"
         )
     if kept := result["kept_frames"]:
         lines.append(f"keeps {kept['frames']} of its frames, {size(kept['bytes'])}: poses can be corrected (remap)")
@@ -187,7 +187,7 @@ def _floor_lines(result: dict[str, Any]) -> list[str]:
     lines.append(f"a floor's map, {result['columns']} x {result['rows']} cells of {side:g} m")
     x, y, yaw = result["origin"]
     turned = f", turned by {np.degrees(yaw):.2f} degrees" if yaw else ""
-    lines.append(f"its lower left corner lies at ({x:g}, {y:g}) m{turned}")
+    lines.append(f"its lower left corner is at ({x:g}, {y:g}) m{turned}")
     if result["bounds"]:
         (x0, y0), (x1, y1) = result["bounds"]
         lines.append(f"known from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m")

@@ -31,7 +31,7 @@ from stereovox.track.tracker import POSE_FAULTS
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
 IN_WORDS = {"depth": "depth image", "stereo": "stereo pair", "cloud": "cloud"}
-"""What recordings consist of."""
+"""Kinds of frames in words."""
 MAX_RATE_HZ = 2000.0
 """Frames a second beyond which the stamps of a recording are wrong."""
 MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/PointCloud2")
@@ -40,7 +40,7 @@ MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/P
 def describe_recording(path: str) -> Description | None:
     """Describe a recording, a bag or a robot's log; None for anything else.
 
-    Raises SourceError for a damaged one, or one that lacks a part.
+    Raises SourceError if it is damaged or lacks a part.
     """
     if suffix_of(file_part(path)) and not RtabmapDatabase.recognises(path):
         return _bag(path)
@@ -56,7 +56,7 @@ def _recording(path: str) -> Description:
 
 
 def _images(path: str) -> Description | None:
-    """Describe depth images without poses; None if missing."""
+    """Describe depth images without poses; None if there are none."""
     try:
         found = survey(open_images(path))  # pyright: ignore[reportArgumentType] - it can be read in any order
     except StereovoxError:
@@ -67,7 +67,7 @@ def _images(path: str) -> Description | None:
 
 
 def _missing(path: str) -> tuple[str, list[str], list[str]]:
-    """Return what a folder of depth images lacks, a line about it, and commands that use it all the same."""
+    """Return what a folder of depth images lacks, a line about it, and commands that work without it."""
     try:
         open_source(path)
     except NoPoses as error:
@@ -88,7 +88,7 @@ def survey_commands(path: str, found: Survey) -> list[str]:
 
 
 def survey_facts(found: Survey) -> dict[str, Any]:
-    """Return what a survey found as numbers and texts for JSON."""
+    """Return the results of a survey as numbers and strings for JSON."""
     camera, up = found.camera, found.up
     return {
         "kind": "recording",
@@ -145,9 +145,9 @@ def _survey_lines(found: Survey) -> list[str]:
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():
-        if reason in POSE_FAULTS and not found.posed:  # said above
+        if reason in POSE_FAULTS and not found.posed:  # reported above
             continue
-        lines.append(f"{count} of {found.read} frames looked at cannot be used: {reason}")
+        lines.append(f"{count} of {found.read} sampled frames cannot be used: {reason}")
     if found.posed:
         lines.append(
             f"mapped by default with depth up to {found.max_range.value:g} m ({found.max_range.why}) and cells of "
@@ -158,23 +158,23 @@ def _survey_lines(found: Survey) -> list[str]:
 
 def _pose_lines(found: Survey) -> list[str]:
     if not found.posed or found.extent_m is None:
-        return ["no frame looked at has a pose: map tracks the camera by its own images, as track does"]
+        return ["no sampled frame has a pose: map tracks the camera by visual odometry, as track does"]
     share = "all" if found.posed == found.read else f"{found.posed} of {found.read}"
     return [
-        f"{share} frames looked at have poses; the camera moves within {metres(found.extent_m)}",
+        f"{share} sampled frames have poses; the camera moves within {metres(found.extent_m)}",
         *([] if found.up is None else [_up_line(found.up)]),
     ]
 
 
 def _up_line(up: UpEstimate) -> str:
     if not up.sure:
-        return f"which way is up is not certain, perhaps {up.axis} ({up.why})"
+        return f"the up direction is not certain, perhaps {up.axis} ({up.why})"
     tilted = f"; {TILTED}" if up.off > LEVEL_ENOUGH else ""
     return f"{up.words} ({up.why}){tilted}"
 
 
 def _rate(rate_hz: float | None) -> str:
-    """Say how many a second, where the stamps can be right."""
+    """Return the rate in words if the stamps can be right."""
     return "" if rate_hz is None or rate_hz > MAX_RATE_HZ else f", {rate_hz:.3g} a second"
 
 
@@ -182,7 +182,7 @@ def _robot(path: str, robot: Robot) -> Description:
     lines, facts = robot_lines(robot)
     out = map_name(path, ".yaml")
     commands = [command_line("slam", path, "--out", out)] if len(robot.scans) else []
-    if len(robot.frames) or "extent_m" in facts:  # it knows where it was
+    if len(robot.frames) or "extent_m" in facts:  # its poses are known
         commands.append(command_line("grid", path, "--out", out))
     commands = [*commands, command_line("picture", out, picture_name(out))]
     return Description("robot", lines, {"kind": "robot", **facts}, commands)
@@ -245,7 +245,7 @@ def _topics(file: BagFile) -> list[dict[str, Any]]:
 
 
 def _bag_depth(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
-    """Add what depth images with poses would give, or why there is nothing to map."""
+    """Add the depth images with poses, or why there is nothing to map."""
     if not any(kind in ("sensor_msgs/Image", "sensor_msgs/CompressedImage") for kind in file.types.values()):
         return
     try:
@@ -261,7 +261,7 @@ def _bag_depth(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
 
 
 def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
-    """Add what scans give."""
+    """Add the scans."""
     if not any(kind in ("sensor_msgs/LaserScan", "sensor_msgs/MultiEchoLaserScan") for kind in file.types.values()):
         return
     try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places for files: a local folder, or a prefix in an object store (`s3://bucket/name`), both used alike.
+"""Places for files: a local folder, or a prefix in an object store (`s3://bucket/name`), with one interface.
 
-Folders need nothing but Python. Object stores are reached through obstore (extra `fleet`), which takes endpoint and
+Folders need only Python. Object stores are reached through obstore (extra `fleet`), which takes endpoint and
 credentials from the usual variables: AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID, AWS_REGION, AWS_ALLOW_HTTP and so on.
 """
 
@@ -23,11 +23,11 @@ from stereovox.files.safe_io import is_url as is_url
 from stereovox.files.safe_io import read_bounded, sync_folder
 
 UNFINISHED = ".unfinished-"
-"""Begins the names of files in a folder that are not yet whole; nobody lists them."""
+"""Prefix of incomplete files in a folder; they are never listed."""
 MAX_FILE = 1 << 32
-"""Bytes that are read at once unless the reader allows others."""
+"""Most bytes that are read at once, unless the caller sets another limit."""
 AT_ONCE = 8
-"""Objects that are put or read at the same time."""
+"""Objects that are written or read at the same time."""
 RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
 
 
@@ -38,16 +38,17 @@ class NoBucketError(MapFileError):
 class Place(ABC):
     """Files by their names, with `/` between the parts of a name.
 
-    A file is written whole or not at all, and the store has it when `write` returns. Places can be pickled; a process
-    that gets one opens its own connection. All methods raise MapFileError, one line with the file, the reason and the
+    A file is written whole or not at all, and is stored when `write` returns. Places can be pickled; a process
+    that receives one opens its own connection. All methods raise MapFileError, one line with the file, the reason and
+    the
     cure.
     """
 
     @staticmethod
     def of(where: str | os.PathLike[str] | Place) -> Place:
-        """Return the place of this name: a URL or a local folder, which need not exist.
+        """Return the place with this name: a URL or a local folder, which need not exist.
 
-        Raises MissingExtra for a URL where obstore is not installed.
+        Raises MissingExtra for a URL if obstore is not installed.
         """
         if isinstance(where, Place):
             return where
@@ -62,11 +63,11 @@ class Place(ABC):
 
     @abstractmethod
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what a file holds, None if missing. Raises MapFileError for one of more than `most` bytes."""
+        """Return the contents of a file, None if missing. Raises MapFileError for more than `most` bytes."""
 
     @abstractmethod
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, whole or not at all; an older one of this name is replaced."""
+        """Write a file, whole or not at all; it replaces an older one of this name."""
 
     @abstractmethod
     def write_all(self, files: dict[str, bytes]) -> None:
@@ -74,9 +75,9 @@ class Place(ABC):
 
     @abstractmethod
     def create(self, name: str, data: bytes) -> bool:
-        """Write a file as `write` does if there is none; return False, and change nothing, where there is one.
+        """Write a file as `write` does if there is none; otherwise return False and change nothing.
 
-        Of several processes that try at the same moment one succeeds.
+        If several processes try at the same moment, only one succeeds.
         """
 
     @abstractmethod
@@ -85,18 +86,18 @@ class Place(ABC):
 
     @abstractmethod
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files, each there or not."""
+        """Remove files; missing ones are ignored."""
 
     def read(self, name: str, most: int = MAX_FILE) -> bytes:
-        """Return what a file holds. Raises MapFileError if there is none, or one of more than `most` bytes."""
+        """Return the contents of a file. Raises MapFileError if it is missing or has more than `most` bytes."""
         data = self.find(name, most)
         if data is None:
-            raise MapFileError(f"{self}/{name}: is not there; what it belongs to is damaged, make it anew")
+            raise MapFileError(f"{self}/{name}: is missing; what it belongs to is damaged, make it again")
         return data
 
     @abstractmethod
     def tidy(self) -> None:
-        """Remove what killed writers left unfinished; no one else may be writing here."""
+        """Remove the incomplete files of killed writers; no one else may be writing here."""
 
     def names(self, prefix: str = "") -> list[str]:
         """Return the names of all files that begin with `prefix`, in ascending order."""
@@ -110,7 +111,7 @@ class Place(ABC):
 
 
 class Folder(Place):
-    """Files below a local folder, which is made by the first `write`."""
+    """Files below a local folder; the first `write` creates it."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -122,7 +123,7 @@ class Folder(Place):
         return Folder(self._path(name))
 
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what a file holds, None if missing; links are not followed."""
+        """Return the contents of a file, None if missing; links are not followed."""
         path = self._path(name)
         with _one_line(path, "read"):
             if path.is_symlink():
@@ -133,18 +134,19 @@ class Folder(Place):
                 return None
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file next to its place and rename it."""
+        """Write a temporary file next to the target and rename it."""
         self.write_all({name: data})
 
     def write_all(self, files: dict[str, bytes]) -> None:
-        """Write files next to their places and rename them; each folder is flushed once."""
+        """Write temporary files next to the targets and rename them; each folder is flushed once."""
         for name, data in files.items():
             with self._unfinished(name, data) as (temporary, path):
                 temporary.replace(path)
         self._flush(files)
 
     def create(self, name: str, data: bytes) -> bool:
-        """Write a file if there is none: a second name for a whole file, which the system gives only once."""
+        """Write a file if there is none, by linking a whole temporary file to its name: the system lets one process
+        win."""
         with self._unfinished(name, data) as (temporary, path):
             try:
                 os.link(temporary, path)
@@ -159,33 +161,34 @@ class Folder(Place):
         found: dict[str, int] = {}
         for above, _, names in os.walk(start):
             for path in (Path(above) / name for name in names if not name.startswith(UNFINISHED)):
-                with suppress(FileNotFoundError):  # removed meanwhile
+                with suppress(FileNotFoundError):  # removed in the meantime
                     if path.is_file() and not path.is_symlink():
                         found[path.relative_to(self.path).as_posix()] = path.stat().st_size
         return {name: found[name] for name in sorted(found) if name.startswith(prefix)}
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove files, and the folders that are empty then, but for the place itself."""
+        """Remove files, and the folders that this leaves empty, except the place itself."""
         for path in map(self._path, names):
             with _one_line(path, "removed"):
                 path.unlink(missing_ok=True)
-            with suppress(OSError):  # something is in it
+            with suppress(OSError):  # not empty
                 for folder in path.parents:
                     if folder == self.path or self.path not in folder.parents:
                         break
                     folder.rmdir()
 
     def tidy(self) -> None:
-        """Remove files that never got their names."""
+        """Remove files that were never renamed to their targets."""
         for above, _, names in os.walk(self.path):
             for name in names:
                 if name.startswith(UNFINISHED):
-                    with suppress(OSError):  # what cannot be removed does no harm
+                    with suppress(OSError):  # a leftover does no harm
                         (Path(above) / name).unlink()
 
     @contextmanager
     def _unfinished(self, name: str, data: bytes) -> Iterator[tuple[Path, Path]]:
-        """Yield a new file on the disk that holds `data`, and the path it is to get; it is removed at the end."""
+        """Yield a temporary file with `data`, flushed to disk, and its target path; the temporary file is removed at
+        the end."""
         path = self.path / _checked(self, name)
         temporary = path.with_name(f"{UNFINISHED}{uuid.uuid4().hex[:12]}")
         with _one_line(path, "written"):
@@ -200,7 +203,7 @@ class Folder(Place):
                 temporary.unlink(missing_ok=True)
 
     def _flush(self, names: Iterable[str]) -> None:
-        """Wait until the disk has the names of these files, and those of the folders that lead to them."""
+        """Wait until the names of these files, and of the folders that lead to them, are on disk."""
         inner = {folder for name in names for folder in self._path(name).parents}
         with _one_line(self.path, "written"):
             for folder in sorted(inner - set(self.path.absolute().parents) - set(self.path.parents), reverse=True):
@@ -225,7 +228,7 @@ class Bucket(Place):
         return Bucket(f"{self.url}/{_checked(self, name)}")
 
     def find(self, name: str, most: int = MAX_FILE) -> bytes | None:
-        """Return what an object holds, None if missing."""
+        """Return the contents of an object, None if missing."""
         with self._one_line(name):
             try:
                 got = self._store.get(_checked(self, name))
@@ -238,12 +241,12 @@ class Bucket(Place):
                 return None
 
     def write(self, name: str, data: bytes) -> None:
-        """Put an object, which stores do whole or not at all."""
+        """Put an object; stores do this whole or not at all."""
         with self._one_line(name):
             self._store.put(_checked(self, name), data)
 
     def create(self, name: str, data: bytes) -> bool:
-        """Put an object on condition that there is none."""
+        """Put an object if there is none."""
         with self._one_line(name):
             try:
                 self._store.put(_checked(self, name), data, mode="create")
@@ -252,13 +255,14 @@ class Bucket(Place):
             return True
 
     def sizes(self, prefix: str = "") -> dict[str, int]:
-        """Return names and bytes of the objects; a store lists whole parts of names, the rest is chosen here."""
+        """Return names and bytes of the objects. Stores only list by whole parts of names; the rest is filtered
+        here."""
         return {item["path"]: item["size"] for item in self._listed(prefix)}
 
     def versions(self, prefix: str = "") -> dict[str, list[Any]]:
-        """Return the names of files as `sizes` does, with bytes and tag, of which one changes with what a file holds.
+        """Return the names of files as `sizes` does, with bytes and a tag that changes with the contents.
 
-        Empty objects that stand for folders, as consoles of stores make them, are left out.
+        Empty objects that represent folders, as consoles of stores create them, are left out.
         """
         found = self._listed(prefix)
         folders = {above for item in found for above in _folders_above(item["path"])}
@@ -275,7 +279,7 @@ class Bucket(Place):
         return sorted(found, key=lambda item: item["path"])
 
     def remove(self, names: Iterable[str]) -> None:
-        """Delete objects, many with one request."""
+        """Delete many objects with one request."""
         if listed := [_checked(self, name) for name in names]:
             with self._one_line(listed[0]):
                 self._store.delete(listed)
@@ -286,14 +290,14 @@ class Bucket(Place):
             list(pool.map(self.write, files.keys(), files.values()))
 
     def tidy(self) -> None:
-        """Do nothing: a store keeps no halves of objects."""
+        """Do nothing: a store keeps no incomplete objects."""
 
     @cached_property
     def _store(self) -> Any:
         _obstore()
         from obstore import store
 
-        make: Any = store.from_url  # its stubs know one overload for each store
+        make: Any = store.from_url  # its stubs have a separate overload for each store
         return make(self.url, retry_config=RETRIES)
 
     @contextmanager
@@ -303,11 +307,11 @@ class Bucket(Place):
         try:
             yield
         except (known.PermissionDeniedError, known.UnauthenticatedError):
-            cure = "the store does not allow it; check the credentials (AWS_ACCESS_KEY_ID and so on)"
+            cure = "the store denies access; check the credentials (AWS_ACCESS_KEY_ID and so on)"
             raise MapFileError(f"{self}/{name}: {cure}") from None
         except (known.BaseError, OSError) as error:
-            if isinstance(error, FileNotFoundError) or "NoSuchBucket" in str(error):  # as a list of objects says it
-                raise NoBucketError(f"{self}: there is no such bucket; check the name, or make it") from None
+            if isinstance(error, FileNotFoundError) or "NoSuchBucket" in str(error):  # the latter from listings
+                raise NoBucketError(f"{self}: there is no such bucket; check the name, or create it") from None
             reason = str(error).partition("\n")[0].strip()[:200]
             raise MapFileError(
                 f"{self}/{name}: the store cannot be used ({reason}); check AWS_ENDPOINT_URL, keys and the network"
@@ -322,10 +326,10 @@ def _folders_above(name: str) -> Iterator[str]:
 
 
 def _checked(place: Place, name: str) -> str:
-    """Return a name; raises MapFileError for one that leads out of the place."""
+    """Return a name; raises MapFileError if it leads out of the place."""
     parts = name.split("/")
     if not name or "\0" in name or "\\" in name or any(part in ("", ".", "..") for part in parts):
-        raise MapFileError(f"{place}: '{name}' is no name of a file in it")
+        raise MapFileError(f"{place}: '{name}' is not a valid file name")
     return name
 
 
@@ -345,4 +349,4 @@ def _one_line(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         reason = error.strerror or error
-        raise MapFileError(f"{path}: cannot be {what} ({reason}); check the name, rights and room") from None
+        raise MapFileError(f"{path}: cannot be {what} ({reason}); check the name, permissions and free space") from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Import and export of maps: one reader and one writer per file type, chosen by the file name's ending."""
+"""Import and export of maps: one reader and one writer per file type, selected by the file name's ending."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ UNREADABLE = {
     ".bonxai": "Bonxai's files have no reader in Python; write the cells of forEachCell as .xyz, x y z a line",
     ".e57": "convert it, for example: pdal translate scan.e57 scan.laz",
     ".pcap": "holds lidar packets; let the lidar's driver write a bag or .pcd",
-    ".svox": "is a map already; open it with stereovox info, picture or view",
+    ".svox": "is already a map; open it with stereovox info, picture or view",
     ".pbstream": "is Cartographer's state; let cartographer_pbstream_to_ros_map write a .yaml",
     ".drc": "is packed by Draco; convert it to .ply",
     ".zip": "unpack it first",
     ".gz": "unpack it first",
     ".bz2": "unpack it first",
 }
-"""What to do with files that cannot be imported, by their ending."""
+"""Remedies for files that cannot be imported, by ending."""
 LFS = b"version https://git-lfs"
-"""Beginning of what git leaves in place of a large file."""
+"""Start of the pointer that git-lfs leaves in place of a large file."""
 EXPORTS = {
     ".bt": "stereovox.formats.octomap:write_bt",
     ".ot": "stereovox.formats.octomap:write_ot",
@@ -92,7 +92,7 @@ def export(
 ) -> None:
     """Write a map in the format that the file name's ending selects; a failed export leaves an older file intact.
 
-    Cells that are not cubes are resampled to cubes where the format knows only those.
+    Cells that are not cubes are resampled to cubes if the format requires it.
 
     Args:
         voxel_map: The map.
@@ -100,13 +100,13 @@ def export(
         heights: For 2-D maps and bags: lowest and highest metres above the floor that a robot occupies (see
             `projection.project`).
         inflate: For 2-D maps: robot radius in metres by which obstacles grow (see `projection.inflated_grid`).
-        floor: For 2-D maps and bags: the floor, or the height in metres of a level one in the world; None: it
-            is found. A bag of a map without a floor holds no 2-D map.
-        start: For 2-D maps and bags: (3,) metres, near the floor that counts, of several.
+        floor: For 2-D maps and bags: the floor, or the height in metres of a level one in the world; None: find
+            it. A bag of a map without a floor holds no 2-D map.
+        start: For 2-D maps and bags: (3,) metres, near the desired floor if there are several.
 
     Raises:
-        StereovoxError: Unknown ending, unwritable place, cells that the format cannot hold, no floor, or an option
-            that has no meaning for this format.
+        StereovoxError: Unknown ending, unwritable path, cells that the format cannot hold, no floor, or an option
+            that does not apply to this format.
     """
     ending = Path(path).suffix.lower()
     known = registry.names("export", EXPORTS)
@@ -116,7 +116,7 @@ def export(
     for name, value in of_floor.items():
         if value is not None and ending not in (*FLAT, *BAGS):
             known = " or ".join((*FLAT, *BAGS))
-            raise StereovoxError(f"{path}: {name} is for 2-D maps alone; end the file's name with {known}")
+            raise StereovoxError(f"{path}: {name} is for 2-D maps only; end the file's name with {known}")
     if inflate is not None and ending not in FLAT:
         raise StereovoxError(f"{path}: only 2-D maps are inflated; end the file's name with {' or '.join(FLAT)}")
     options = {**of_floor, "inflate": inflate}
@@ -136,26 +136,26 @@ def import_map(
 ) -> VoxelMap:
     """Read a map from another program's file, or from one that `export` wrote.
 
-    `.bt`, `.ot`: OctoMap's cells. `.graph`: OctoMap's scans, with what they passed free. `.npz`: ours, exactly.
+    `.bt`, `.ot`: OctoMap's cells. `.graph`: OctoMap's scans, which also mark free space. `.npz`: ours, exactly.
     Point clouds and meshes (`CLOUDS`): each cell that holds a point or a piece of surface is occupied, all others are
     unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic. Floors
-    (`FLOORS`): their cells as columns between `heights`. What was decided for want of an option stands in the map's
+    (`FLOORS`): their cells as columns between `heights`. Choices made for missing options are recorded in the map's
     `history.imported`.
 
     Args:
         path: File or rosbag2 folder.
-        voxel_size: Metres, for points; None: one suggested by their density, or that in our own files.
+        voxel_size: Metres, for points; None: a size suggested by their density, or that in our own files.
         topic: Topic in a bag (see `bags.read_bag_map`).
         unit: Unit of points: `m`, `cm`, `mm`, `ft` or `us-ft`; None: the file's own, else metres.
-        origin: (3,) point of the file, in metres, that becomes the map's origin; None: 0, or where points lie more than
+        origin: (3,) point of the file, in metres, that becomes the map's origin; None: 0, or if points are more than
             10 km from it, a point among them.
-        heights: Lowest and highest metres to which a floor's map is raised.
+        heights: Lowest and highest metres between which a floor's map is raised.
 
     Returns:
         The map.
 
     Raises:
-        StereovoxError: What is wrong with the file, or an option that this kind of file does not take.
+        StereovoxError: The file is invalid, or an option does not apply to this kind of file.
     """
     ending = ".mcap" if Path(path).is_dir() and not is_map(path) else Path(path).suffix.lower()
     known = registry.names("import", IMPORTS)
@@ -166,7 +166,7 @@ def import_map(
     for name in given:
         if ending not in OPTIONS[name]:
             option = f"--{name.replace('_', '-')}"
-            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
+            raise StereovoxError(f"{path}: {option} does not apply to '{ending}' files; leave it out")
     _check_content(Path(path))
     made = registry.find("import", IMPORTS, ending)(path, **given)
     if made.history.imported is None:
@@ -178,7 +178,7 @@ def _cure(ending: str, known: Sequence[str]) -> str:
     if ending in UNREADABLE:
         return UNREADABLE[ending]
     if not ending:
-        return f"has no ending that tells what it is; rename it to one of {' '.join(sorted(known))}"
+        return f"has no ending that identifies its format; rename it to one of {' '.join(sorted(known))}"
     return (
         f"cannot import '{ending}'{did_you_mean(ending, known) if get_close_matches(ending, known) else ''}; points as "
         "text end in .xyz, clouds in .ply, .pcd or .las, OctoMap's files in .bt, .ot or .graph; "
@@ -194,6 +194,6 @@ def _check_content(path: Path) -> None:
         with path.open("rb") as file:
             pointer = file.read(len(LFS)) == LFS
     except OSError:
-        return  # the reader says what is wrong
+        return  # the reader reports the error
     if pointer:
         raise StereovoxError(f"{path}: is a pointer of git-lfs, not the file; fetch it with: git lfs pull")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that read OctoMap's node streams.
 
-A branch waits on a stack as (lowest cell x, y, z; height): a node of height h is 2^h cells wide. Children are pushed
-last first, so that they are popped in file order; a stack never holds more than 7 siblings a level and one node.
+Pending branches are on a stack as (lowest cell x, y, z; height): a node of height h is 2^h cells wide. Children are
+pushed last first, so that they are popped in file order; a stack never holds more than 7 siblings a level and one node.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ BLOCK_HEIGHT = 3
 def read_binary_leaves(records, corners, heights, occupied):
     """Read the leaves of a `.bt` tree from its branches (n,) uint16; return their number.
 
-    Writes lowest cells (m, 3) int32, heights (m,) and occupied (m,) bool. ValueError: what is wrong with the stream.
+    Writes lowest cells (m, 3) int32, heights (m,) and occupied (m,) bool. Raises ValueError if the stream is invalid.
     """
     stack = np.empty((STACK, 4), np.int32)
     stack[0, :3] = -(1 << (HEIGHT - 1))
@@ -62,8 +62,8 @@ def read_binary_leaves(records, corners, heights, occupied):
 def read_tree_leaves(children, corners, heights, records):
     """Read the leaves of an `.ot` tree from its nodes' child bits (n,) uint8; return their number.
 
-    Writes lowest cells (m, 3) int32, heights (m,) and the place of the node in the file (m,).
-    ValueError: what is wrong with the stream.
+    Writes lowest cells (m, 3) int32, heights (m,) and the index of the node in the file (m,).
+    Raises ValueError if the stream is invalid.
     """
     stack = np.empty((STACK, 4), np.int32)
     stack[0, :3] = -(1 << (HEIGHT - 1))
@@ -100,7 +100,7 @@ def read_tree_leaves(children, corners, heights, records):
 def fill_blocks(corners, heights, units, coords, values):
     """Write leaves into blocks of 8x8x8 cells: coordinates (b, 3), values (b, 512) that were zero; return b.
 
-    Leaves that share a block follow each other.
+    Leaves that share a block are consecutive.
     """
     block = -1
     for leaf in range(heights.size):

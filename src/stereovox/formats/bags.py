@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished maps in bags: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap` and `sensor_msgs/PointCloud2`, both ways."""
+"""Finished maps in bags: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap`, `sensor_msgs/PointCloud2`, read and
+written."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ from stereovox.sources.bags.robot_messages import (
 from stereovox.sources.bags.writer import BagWriter
 
 MAP_FRAME, CELLS_FRAME = "map", "map_cells"
-"""Names of the frame whose z is up, and of that of the cells where another axis is up in it."""
+"""Names of the frame whose z is up, and of the cells' frame if another axis of the map is up."""
 MapT = TypeVar("MapT")
 
 
@@ -44,13 +45,13 @@ def write_bag(
     floor: FloorHeights | float | None = None,
     start: ArrayLike | None = None,
 ) -> None:
-    """Write the map into a bag of its own, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), all latched.
+    """Write the map into a new bag, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), with all topics latched.
 
     `/octomap_full`: an Octomap of every known cell with its log-odds. `/occupied_cells`: a PointCloud2 of the centres
     of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights, floor and start: see
     `projection.project`; left out if the map shows no floor.
-    All are in frame `map`; where the map's `up` is not z, the first two are in `map_cells`, which `/tf_static` turns.
-    Stamps are the last frame's, or zero. Raises MapFileError for what cannot be written, MissingExtra
+    All are in frame `map`; if the map's `up` is not z, the first two are in `map_cells`, rotated by `/tf_static`.
+    Stamps are the last frame's, or zero. Raises MapFileError if the map cannot be written, MissingExtra
     without rosbags.
     """
     axes = upright_axes(voxel_map.config.up)
@@ -87,16 +88,17 @@ def write_grid_bag(grid: OccupancyGrid, path: str | Path) -> None:
 
 
 def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
-    """Return the map in the last Octomap of a bag's topic, cell for cell; or the cells that a PointCloud2 marks.
+    """Return the map in the last Octomap of a bag's topic, cell for cell, or the cells that contain a PointCloud2's
+    points.
 
-    topic: required where the bag has several Octomaps, and for a PointCloud2, whose points are used as world
-    coordinates. voxel_size: metres, for a PointCloud2 only; None: one suggested. Raises MapFileError.
+    topic: required if the bag has several Octomaps, and for a PointCloud2, whose points are used as world
+    coordinates. voxel_size: metres, for a PointCloud2 only; None: a suggested one. Raises MapFileError.
     """
     path_name = Path(path).name
 
     def octomap_cells(wire: Wire) -> VoxelMap:
         if voxel_size is not None:
-            raise ValueError("an Octomap reports how large its cells are; leave --voxel-size out")
+            raise ValueError("an Octomap has its own cell size; leave --voxel-size out")
         return _octomap_cells(wire)
 
     def cloud_cells(wire: Wire) -> VoxelMap:
@@ -108,7 +110,7 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
 
 
 def read_bag_grid(path: str | Path, topic: str | None = None) -> OccupancyGrid:
-    """Return the last OccupancyGrid of a bag's topic; topic: required where there are several. Raises MapFileError."""
+    """Return the last OccupancyGrid of a bag's topic; topic: required if there are several. Raises MapFileError."""
     return _last(Path(path), topic, {OCCUPANCY_GRID: read_occupancy_grid})
 
 
@@ -119,7 +121,7 @@ def _octomap_cells(wire: Wire) -> VoxelMap:
 
 
 def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], MapT]]) -> MapT:
-    """Return what the reader of its type makes of a topic's last message; None: the only topic of the first type."""
+    """Read the last message of a topic with the reader of its type; None: the only topic of the first type."""
     try:
         bag = open_bag(path)
         topic = topic or _only(bag.types, next(iter(readers)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suggest how large cells should be, from how dense points lie and how far they reach."""
+"""Suggest a cell size from the density and the extent of points."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAMPLE, QUERIES = 400_000, 4_000
-"""Points of a larger cloud that are looked at, and how many of them are asked for their neighbours."""
+"""Points sampled from a larger cloud, and how many of them are queried for their neighbours."""
 NEIGHBOUR = 4
-"""Neighbour whose distance counts: on a surface of even density it is about as far as the points are apart."""
+"""Neighbour whose distance counts: on a surface of even density it is about the spacing of the points."""
 FEWEST = 10
 """Distinct points below which nothing is suggested."""
 PER_CELL = 2.0
@@ -22,14 +22,14 @@ MOST_ALONG = 2000
 LARGEST = 100.0
 """Metres; the settings allow no larger cells."""
 MESH_ALONG = 256
-"""Cells along the longest side of a mesh, whose vertices say nothing about it."""
+"""Cells along the longest side of a mesh, whose vertices give no cell size."""
 OUTLIERS = 0.1
 """Per cent of the points at each end of an axis that its extent leaves out."""
 STEPS = (1, 2, 5, 10)
 
 
 class SuggestedCell(NamedTuple):
-    """voxel_size: metres, 1, 2 or 5 times a power of ten. why: in a few words. spacing: metres between neighbours."""
+    """voxel_size: metres, 1, 2 or 5 times a power of ten. why: a short reason. spacing: metres between neighbours."""
 
     voxel_size: float
     why: str
@@ -37,9 +37,9 @@ class SuggestedCell(NamedTuple):
 
 
 def suggested_cell(xyz: NDArray[np.float64]) -> SuggestedCell | None:
-    """Return the cell size for finite points (N, 3) in metres; None if they tell none: too few, or all in one place.
+    """Return the cell size for finite points (N, 3) in metres; None if they are too few, or all in one place.
 
-    Twice the typical distance of neighbouring points, so that a surface has no holes; larger where the longest side
+    Twice the typical distance of neighbouring points, so that a surface has no holes; larger if the longest side
     would have more than `MOST_ALONG` cells.
     """
     spacing = typical_spacing(xyz)
@@ -50,7 +50,7 @@ def suggested_cell(xyz: NDArray[np.float64]) -> SuggestedCell | None:
         return SuggestedCell(_allowed(extent / MOST_ALONG), f"since it is {extent:.3g} m long", spacing)
     return SuggestedCell(
         _allowed(PER_CELL * spacing),
-        f"since its points lie about {spacing if spacing < 10 else round(spacing):.3g} m apart",
+        f"since its points are about {spacing if spacing < 10 else round(spacing):.3g} m apart",
         spacing,
     )
 
@@ -66,7 +66,7 @@ def suggested_for_mesh(vertices: NDArray[np.float64]) -> SuggestedCell | None:
 def typical_spacing(xyz: NDArray[np.float64]) -> float | None:
     """Return the median distance in metres of points (N, 3) from their `NEIGHBOUR`-th neighbour; None: too few points.
 
-    Of a large cloud a part is looked at, and its distances are scaled as those on surfaces are.
+    A large cloud is sampled, and the distances are scaled as on surfaces.
     """
     from scipy.spatial import KDTree
 

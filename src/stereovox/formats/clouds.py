@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point clouds and meshes of other programs as maps: their unit, their origin and the size of the cells.
 
-`read_cloud` takes a file for what it is, `map_of_cloud` decides what the file leaves open, and the map remembers both.
+`read_cloud` reads the file as it is, `map_of_cloud` decides what the file leaves open, and the map records both.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.point_files import MAX_BYTES, read_points
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937}
-"""Metres of each unit that `--unit` knows."""
+"""Metres of each unit that `--unit` accepts."""
 FAR, ROUND = 10_000.0, 100.0
-"""Metres from 0 beyond which coordinates get another origin, and what that is a multiple of."""
+"""Metres from 0 beyond which coordinates get a new origin, and the multiple it is rounded to."""
 EARTH = 2e7
-"""Metres; no map has larger coordinates: half of the way round the Earth."""
+"""Metres; no map has larger coordinates: half of the Earth's circumference."""
 SPARSE, TINY = 0.5, 0.02
-"""Points so many metres apart, or a cloud so many metres long: metres may be the wrong unit."""
+"""Spacing of points, or length of a cloud, in metres, beyond which metres may be the wrong unit."""
 SAMPLES_OF_ANY, SAMPLES_A_TRIANGLE, MAX_SAMPLES = 4_000_000, 1000, 16_000_000
-"""Points that any mesh may be sampled to, more for each of its triangles, and never more than these."""
+"""Samples allowed for any mesh, more for each of its triangles, and the upper limit."""
 PER_CELL = 2
 """Samples of a mesh along the side of a cell."""
 MAX_LIDAR_M = 1000.0
-"""Metres within which the points of a KITTI scan lie."""
+"""Largest distance in metres of points in a KITTI scan."""
 MESHES = (".stl", ".obj", ".off")
 TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
 LAS = (".las", ".laz")
 
 
 class PointFile(NamedTuple):
-    """Points as they stand in a file.
+    """Points as stored in a file.
 
-    xyz: (N, 3) float64, in the file's unit and frame; not finite if there is none. holds: what the file is, in a few
-    words. voxel_size: metres, where the file has the centres of cells and says so. faces: (M, 3) whole numbers, which
-    points are the corners of each triangle; None for bare points. metres: metres per unit along each axis, and how the
-    file says so; None if it says nothing. notes: what the user should know.
+    xyz: (N, 3) float64, in the file's unit and frame; not finite if invalid. holds: a short description of the
+    file. voxel_size: metres, if the file declares that its points are centres of cells. faces: (M, 3) integers,
+    the points at the corners of each triangle; None for bare points. metres: metres per unit along each axis, and its
+    source in the file; None if unknown. notes: what the user should know.
     """
 
     xyz: NDArray[np.float64]
@@ -70,9 +70,9 @@ def read_cloud_map(
 ) -> VoxelMap:
     """Return a map in which each cell that holds a point, or a piece of a mesh, is occupied, all others unknown.
 
-    voxel_size: metres; None: the file's own, else one suggested. unit: of `UNITS`; None: the file's own, else metres.
+    voxel_size: metres; None: the file's own, else a suggested one. unit: of `UNITS`; None: the file's own, else metres.
     origin: (3,) point in metres, in the file's frame, that becomes the map's origin; None: that of the file, unless it
-    is far away. Raises MapFileError: one line with the file and what is wrong.
+    is far away. Raises MapFileError: one line with the file and the problem.
     """
     try:
         return map_of_cloud(read_cloud(path), Path(path).name, voxel_size, unit, origin)
@@ -102,7 +102,7 @@ def read_cloud(path: str | Path) -> PointFile:
         return _mesh(path, "ply")
     kind = "PLY" if points.ply else "PCD"
     rows = f"{points.width} x {points.height}, " if points.height > 1 else ""
-    notes = ("its VIEWPOINT is not applied: points lie as the file has them",) if points.turned else ()
+    notes = ("its VIEWPOINT is not applied: points are used as stored",) if points.turned else ()
     return PointFile(points.xyz, f"{kind}, {rows}{_count(points.xyz)}", points.voxel_size, notes=notes)
 
 
@@ -113,11 +113,11 @@ def map_of_cloud(
     unit: str | None = None,
     origin: Sequence[float] | None = None,
 ) -> VoxelMap:
-    """Return the map of a cloud; name: of its file, for the map's memory; the rest as in `read_cloud_map`.
+    """Return the map of a cloud; name: of its file, for the map's history; the rest as in `read_cloud_map`.
 
     Raises StereovoxError.
     """
-    if cloud.voxel_size is not None and unit is None and origin is None:  # one of ours: nothing is left open
+    if cloud.voxel_size is not None and unit is None and origin is None:  # our own file: nothing is left open
         made = cells_of_points(cloud.xyz, cloud.voxel_size if voxel_size is None else voxel_size)
         made.history.imported = Imported(name, cloud.holds)
         return made
@@ -137,10 +137,10 @@ def _count(xyz: NDArray[np.float64]) -> str:
 
 
 def _in_metres(cloud: PointFile, unit: str | None) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return the points in metres, and a note where the file decided that; raises StereovoxError for a bad unit."""
+    """Return the points in metres, and a note if the file defines the unit; raises StereovoxError for a bad unit."""
     if unit is not None:
         if unit not in UNITS:
-            raise StereovoxError(f"--unit {unit}: no unit that is known; give one of {', '.join(UNITS)}")
+            raise StereovoxError(f"--unit {unit}: unknown unit; give one of {', '.join(UNITS)}")
         return cloud.xyz * UNITS[unit], (f"taken as {unit}",) if unit != "m" else ()
     if cloud.metres is None or cloud.metres[0] == (1.0, 1.0, 1.0):
         return cloud.xyz, ()
@@ -150,11 +150,11 @@ def _in_metres(cloud: PointFile, unit: str | None) -> tuple[NDArray[np.float64],
 def _near_origin(
     xyz: NDArray[np.float64], origin: Sequence[float] | None
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Return the points about the map's origin, and a note if that is not the file's."""
+    """Return the points relative to the map's origin, and a note if that is not the file's."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if np.abs(finite).max() > EARTH:
         raise StereovoxError(
-            f"a coordinate of {np.abs(finite).max():.3g} m lies beyond the Earth; give --unit, or name columns x,y,z"
+            f"a coordinate of {np.abs(finite).max():.3g} m is beyond the Earth; give --unit, or name columns x,y,z"
         )
     if origin is not None:
         given = np.asarray(origin, np.float64)
@@ -173,7 +173,7 @@ def _point(point: NDArray[np.float64]) -> str:
 def _sized(
     xyz: NDArray[np.float64], cloud: PointFile, name: str, voxel_size: float | None, unit: str | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the side of a cell, and notes: why it was chosen, and where the unit is doubtful."""
+    """Return the side of a cell, and notes: why it was chosen, and whether the unit is doubtful."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if cloud.voxel_size is not None:
         return cloud.voxel_size if voxel_size is None else voxel_size, ()
@@ -182,7 +182,7 @@ def _sized(
         return voxel_size, _unit_notes(finite, cloud, unit, suggested)
     if suggested is None:
         raise StereovoxError(
-            f"{len(finite)} points do not tell a size of cells; type: stereovox import {name} MAP --voxel-size 0.05"
+            f"{len(finite)} points do not determine a cell size; type: stereovox import {name} MAP --voxel-size 0.05"
         )
     notes = (f"cells of {suggested.voxel_size:g} m, {suggested.why} (--voxel-size overrides)",)
     return suggested.voxel_size, notes + _unit_notes(finite, cloud, unit, suggested)
@@ -191,7 +191,7 @@ def _sized(
 def _unit_notes(
     xyz: NDArray[np.float64], cloud: PointFile, unit: str | None, suggested: SuggestedCell | None
 ) -> tuple[str, ...]:
-    """Return a note where nobody says the unit of points (N, 3) and metres may be the wrong one."""
+    """Return a note if the unit of points (N, 3) is unspecified and metres may be wrong."""
     length = float(extents(xyz).max())
     sparse = suggested is not None and suggested.spacing is not None and suggested.spacing > SPARSE
     if unit is not None or cloud.metres is not None or not (sparse or length < TINY or cloud.faces is not None):
@@ -201,7 +201,7 @@ def _unit_notes(
 
 
 def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size: float) -> NDArray[np.float64]:
-    """Return points (M, 3) on all triangles, in rows along their longest sides; rows and points lie at most half a cell
+    """Return points (M, 3) on all triangles, in rows along their longest sides; rows and points are at most half a cell
     apart.
 
     Raises StereovoxError for too many points.
@@ -231,7 +231,7 @@ def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size
 
 
 def _shares(steps: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return for each of `steps` (N,) the shares 0, 1/steps, ..., 1 (M,), and which of the N each belongs to (M,)."""
+    """Return for each of `steps` (N,) the shares 0, 1/steps, ..., 1 (M,), and the index of its step (M,)."""
     owner = np.repeat(np.arange(len(steps)), steps + 1)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(steps + 1) - steps - 1, steps + 1)
     return owner, number / np.maximum(steps, 1)[owner]
@@ -244,12 +244,12 @@ def _lidar_scan(path: str | Path) -> PointFile:
     except StereovoxError as error:
         raise MapFileError(str(error)) from None
     if not len(xyz) or np.abs(xyz).max() > MAX_LIDAR_M:
-        raise MapFileError(f"{path}: no KITTI velodyne scan (float32 x, y, z, reflectance); save it as .ply or .pcd")
+        raise MapFileError(f"{path}: not a KITTI velodyne scan (float32 x, y, z, reflectance); save it as .ply or .pcd")
     return PointFile(xyz, f"KITTI velodyne scan, {_count(xyz)}", metres=((1.0, 1.0, 1.0), "metres"))
 
 
 def _mesh(path: str | Path, kind: str) -> PointFile:
-    """Return the corners and triangles of a mesh, larger faces cut into triangles; of one without, its points."""
+    """Return the corners and triangles of a mesh, with larger faces split; without faces, its points."""
     import trimesh
 
     content = _bytes(path)
@@ -262,10 +262,10 @@ def _mesh(path: str | Path, kind: str) -> PointFile:
         faces = [np.asarray(getattr(part, "faces", np.empty((0, 3))), np.int64) for part in parts]
         faces = np.concatenate([np.empty((0, 3), np.int64), *(f + n for f, n in zip(faces, sizes, strict=False))])
         if prod(faces.shape) and not (faces.min() >= 0 and faces.max() < len(xyz)):
-            raise ValueError("a triangle has corners that are not there")
+            raise ValueError("a triangle has missing corners")
     except Exception as error:  # what a damaged file can raise in trimesh is not bounded
         why = (" ".join(str(error).split()) or type(error).__name__)[:100]
-        raise MapFileError(f"{path}: no mesh that can be read ({why}); export it again") from None
+        raise MapFileError(f"{path}: not a readable mesh ({why}); export it again") from None
     if not len(faces):
         return PointFile(xyz, f"{kind.upper()}, {_count(xyz)}")
     return PointFile(xyz, f"{kind.upper()} mesh, surface of {len(faces):,} triangles", faces=faces)

@@ -21,7 +21,7 @@ from stereovox.maps.record.history import Imported
 from stereovox.products.floor.floor_axes import checked_heights
 
 WITHIN = (1 / 6, 1 / 2, 5 / 6)
-"""Places in a cell, as shares of its side, that are looked up in the floor's map."""
+"""Points in a cell, as shares of its side, that are looked up in the floor's map."""
 MAX_CELLS = 1 << 27
 WORST = (State.FREE, State.TENTATIVE, State.UNKNOWN, State.OCCUPIED)
 """States from the best to the worst."""
@@ -30,12 +30,12 @@ WORST = (State.FREE, State.TENTATIVE, State.UNKNOWN, State.OCCUPIED)
 def read_raised_floor(path: str | Path, heights: Sequence[float] | None = None) -> VoxelMap:
     """Return the floor's map at `path` (`map_server.read_map_server`) raised from the lower to the higher of `heights`.
 
-    Raises MapFileError: one line with the file and what is wrong, or that `heights` are missing.
+    Raises MapFileError: one line with the file and the problem, or that `heights` are missing.
     """
     grid = read_map_server(path)
     if heights is None:
         raise MapFileError(
-            f"{path}: is the map of a floor; info, picture, eval, localize and path take it as it is, MAP.yaml copies "
+            f"{path}: is the map of a floor; info, picture, eval, localize and path read it as it is, MAP.yaml copies "
             "it, and --heights 0:2 raises its walls to a map in space"
         )
     low, high = heights
@@ -52,7 +52,7 @@ def read_raised_floor(path: str | Path, heights: Sequence[float] | None = None) 
 def raised(grid: OccupancyGrid, heights: tuple[float, float]) -> VoxelMap:
     """Return a map in which each known cell of `grid` is a column of cells from the lower to the higher of `heights`.
 
-    Where the grid is turned, or its corner lies between cells, a cell is the worst of what lies in it: occupied before
+    If the grid is rotated, or its corner is inside a cell, a cell takes the worst state in it: occupied before
     unknown before tentative before free. Raises StereovoxError for an unknown floor or too many cells.
     """
     low, high = checked_heights(heights)
@@ -60,7 +60,7 @@ def raised(grid: OccupancyGrid, heights: tuple[float, float]) -> VoxelMap:
     layers = np.arange(np.floor(low / size + 1e-6), np.ceil(high / size - 1e-6))
     corners = se2.transform(grid.origin, grid.known_corners * size) / size
     if not len(corners):
-        raise StereovoxError("nothing is known in it, there is nothing to raise")
+        raise StereovoxError("it has no known cell, there is nothing to raise")
     first, last = np.floor(corners.min(axis=0) + 1e-6), np.ceil(corners.max(axis=0) - 1e-6)
     if np.prod(last - first) * len(layers) > MAX_CELLS:
         raise StereovoxError(f"more than {MAX_CELLS} cells between these heights; give lower --heights")
@@ -79,7 +79,7 @@ def raised(grid: OccupancyGrid, heights: tuple[float, float]) -> VoxelMap:
 
 
 def _worst(grid: OccupancyGrid, cells: NDArray[np.floating | np.integer]) -> NDArray[np.uint8]:
-    """Return the worst state (N,) of the grid in cells (N, 2) of its size; outside it is unknown."""
+    """Return the worst state (N,) of the grid in cells (N, 2) of its size; unknown outside it."""
     states = np.pad(grid.states, 1, constant_values=State.UNKNOWN)
     limits = np.array(states.shape) - 1
     rank = np.argsort(WORST)

@@ -20,12 +20,12 @@ from stereovox.files.safe_io import read_bounded
 MAX_BYTES = 1 << 32
 MAX_POINTS = 1 << 28
 PER_BYTE = 50
-"""Points for each byte of a packed file; LAZ needs several bytes for a point, but for equal ones."""
+"""Points for each byte of a packed file; LAZ needs several bytes per point, unless points are equal."""
 AT_ONCE = 1 << 20
 HEADER, RECORD, LONG_RECORD, LEAST_POINT = 227, 54, 60, 20
-"""Fewest bytes of the header, of a record, of a long record and of a point."""
+"""Minimum bytes of the header, of a record, of a long record and of a point."""
 LASZIP, LAYERED, FEWEST_LAYERS = 22204, 6, 9
-"""Record that describes the packing; first point format that is packed in layers, and how many it has."""
+"""Record that describes the packing; first point format that is packed in layers, and its number of layers."""
 PACKED = 0xC0
 """Bits of the point format that mark packed points."""
 MODEL, LINEAR_UNIT, VERTICAL_UNIT = 1024, 3076, 4099
@@ -34,12 +34,12 @@ GEOGRAPHIC = 2
 EPSG_UNITS = {9001: (1.0, "metres"), 9002: (0.3048, "feet"), 9003: (1200 / 3937, "US survey feet")}
 WKT_UNIT = re.compile(r'UNIT\["([^"]*)",\s*([0-9.eE+-]+)')
 DEGREES = (
-    "its x and y are degrees, no lengths; project it, for example: pdal translate IN OUT reprojection "
+    "its x and y are degrees, not lengths; project it, for example: pdal translate IN OUT reprojection "
     "--filters.reprojection.out_srs=EPSG:32633 (the UTM zone of the place)"
 )
 
 
-class _Degrees(Exception):  # noqa: N818 - what the coordinates are
+class _Degrees(Exception):  # noqa: N818 - not an error by itself
     """The coordinates are degrees."""
 
 
@@ -52,7 +52,7 @@ class LasPoints(NamedTuple):
 
 
 def read_las(path: str | Path) -> LasPoints:
-    """Return the points of a survey, and the unit of its coordinate system where it names one.
+    """Return the points of a survey, and the unit of its coordinate system if it names one.
 
     Raises MapFileError: unreadable, damaged, or in degrees; MissingExtra without laspy.
     """
@@ -63,7 +63,7 @@ def read_las(path: str | Path) -> LasPoints:
     try:
         content = read_bounded(Path(path), MAX_BYTES)
         _check_header(content)
-        one_thread = laspy.LazBackend.Lazrs  # several make room for whole chunks, however long the file says they are
+        one_thread = laspy.LazBackend.Lazrs  # several threads allocate whole chunks, whatever length the file declares
         with laspy.open(io.BytesIO(content), laz_backend=one_thread) as reader:
             header = reader.header
             _check_count(header, len(content))
@@ -75,21 +75,21 @@ def read_las(path: str | Path) -> LasPoints:
     except _Degrees:
         raise MapFileError(f"{path}: {DEGREES}") from None
     except struct.error:
-        raise MapFileError(f"{path}: no points that can be read: it is cut off; copy or export it again") from None
+        raise MapFileError(f"{path}: no readable points: it is cut off; copy or export it again") from None
     except BaseException as error:  # what a damaged file can raise in laspy and its Rust library is not bounded
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         why = (" ".join(str(error).split()) or type(error).__name__)[:120]
-        raise MapFileError(f"{path}: no points that can be read: {why}; copy or export it again") from None
+        raise MapFileError(f"{path}: no readable points: {why}; copy or export it again") from None
     kind = "LAZ" if header.are_points_compressed else "LAS"
     return LasPoints(xyz, f"{kind} {header.version}, {len(xyz):,} points", metres)
 
 
 def _check_header(content: bytes) -> None:
-    """Raise ValueError for counts and places in the header that the file has no room for; laspy believes them all."""
+    """Raise ValueError for counts and offsets in the header that the file has no room for; laspy trusts them all."""
     size = len(content)
     if not content.startswith(b"LASF") or size < HEADER:
-        raise ValueError("it does not begin as a survey does")
+        raise ValueError("its header is not a survey's")
     start, offset, records = struct.unpack_from("<HII", content, 94)
     if not start + records * RECORD <= offset <= size:
         raise ValueError(f"{records} records before byte {offset} of {size}")
@@ -102,11 +102,11 @@ def _check_header(content: bytes) -> None:
 
 
 def _check_chunks(content: bytes, offset: int) -> None:
-    """Raise ValueError if the table of packed chunks lies outside the file or names too many of them."""
+    """Raise ValueError if the table of packed chunks is outside the file or lists too many of them."""
     (table,) = struct.unpack_from("<q", content, offset)
     (table,) = struct.unpack_from("<q", content, len(content) - 8) if table == -1 else (table,)
     if not offset + 8 <= table <= len(content) - 8:
-        raise ValueError(f"the table of its chunks lies at byte {table} of {len(content)}")
+        raise ValueError(f"the table of its chunks is at byte {table} of {len(content)}")
     (chunks,) = struct.unpack_from("<I", content, table + 4)
     if chunks * LEAST_POINT > len(content):
         raise ValueError(f"{chunks} chunks in {len(content)} bytes")
@@ -121,13 +121,14 @@ def _check_count(header: Any, size: int) -> None:
 
 
 def _check_layers(content: bytes, header: Any) -> None:
-    """Raise ValueError if a packed chunk says that one of its layers is longer than the chunk.
+    """Raise ValueError if a packed chunk declares a layer longer than the chunk.
 
-    Points of format 6 and more are packed in layers: a chunk is a point, a count, the bytes of each layer, and these.
+    Points of format 6 and above are packed in layers: a chunk is a point, a count, the size of each layer, and the
+    layers.
     """
     if not header.are_points_compressed or header.point_format.id < LAYERED:
         return
-    lazrs: Any = import_module("lazrs")  # which tells checkers nothing of what it holds
+    lazrs: Any = import_module("lazrs")  # has no type information
     stream = io.BytesIO(content)
     stream.seek(header.offset_to_point_data)
     packing = next(vlr for vlr in header.vlrs if vlr.record_id == LASZIP)
@@ -149,7 +150,7 @@ def _pieces(reader: Any) -> Iterator[NDArray[np.float64]]:
 def _metres(header: Any) -> tuple[tuple[float, float, float], str] | None:
     """Return metres per unit along x, y and z, and the unit's name; None if the file names none.
 
-    Raises _Degrees where x and y are degrees.
+    Raises _Degrees if x and y are degrees.
     """
     texts = [vlr.string for vlr in header.vlrs if hasattr(vlr, "string")]
     keys = [key for vlr in header.vlrs for key in getattr(vlr, "geo_keys", ())]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of ROS's map_server and nav2_map_server: an image, and a .yaml with its meaning."""
+"""Maps of ROS's map_server and nav2_map_server: an image, and a .yaml that explains it."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 MAX_PIXELS = 1 << 28
 MAX_BYTES = 1 << 31
-"""Images of more pixels, and files of more bytes, are refused."""
+"""Larger images, in pixels or bytes, are refused."""
 WHITE = 255.0
 FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
 PIXELS_A_BYTE = 512
 PIXELS_OF_ANY = 1 << 22
-"""A compressed image has at most so many pixels per byte of its file; one of few pixels may have fewer bytes."""
+"""Most pixels of a compressed image per byte of its file; small images may exceed it."""
 _NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
-"""What map_saver writes. With a free_thresh of 0.25, as nav2 has it, its own grey 205, unknown, is read as free."""
+"""Values that map_saver writes. With nav2's free_thresh of 0.25, its own grey 205, unknown, would be read as free."""
 FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL, NO_PIXEL = 254, 205, 0, 128
 SCALE_STEPS = 254
-"""Greys of mode scale between 0 and 99 per cent: each per cent is read back as it was."""
+"""Grey levels of mode scale between 0 and 99 per cent: each per cent is read back unchanged."""
 
 
 def read_map_server(path: str | Path) -> OccupancyGrid:
-    """Return the map whose .yaml is `path`, or stands next to `path` if that is its picture.
+    """Return the map of a .yaml `path`, or of the .yaml next to `path` if that is its picture.
 
-    With p = (255 - brightness) / 255, or brightness / 255 where `negate` is set, cells are, by mode:
-    trinary: 100 where p > occupied_thresh, 0 where p < free_thresh, else -1; opacity counts as one more colour.
+    With p = (255 - brightness) / 255, or brightness / 255 if `negate` is set, cells are, by mode:
+    trinary: 100 if p > occupied_thresh, 0 if p < free_thresh, else -1; opacity counts as one more colour.
     scale: the same, but between them 99 (p - free_thresh) / (occupied_thresh - free_thresh) rounded down, and -1
-    where the picture lets the background through.
-    raw: the brightness, rounded down, where that is 0 to 100, else -1. The map's thresholds are then the file's.
+    for transparent pixels.
+    raw: the brightness, rounded down, if that is 0 to 100, else -1. The map's thresholds are then the file's.
     (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
-    Raises MapFileError: one line with the file and what is wrong.
+    Raises MapFileError: one line with the file and the problem.
     """
     metadata = metadata_of(path)
     cells = np.ascontiguousarray(_cells(read_picture(metadata.image), metadata)[::-1])
@@ -58,7 +58,7 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
 
 
 def metadata_of(path: str | Path) -> Metadata:
-    """Return the contents of the .yaml `path`, or of that next to `path` if that is a picture.
+    """Return the contents of the .yaml `path`, or of the .yaml next to `path` if that is a picture.
 
     Raises MapFileError for anything invalid.
     """
@@ -68,13 +68,14 @@ def metadata_of(path: str | Path) -> Metadata:
 def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
     """Write an image and its .yaml; `path` names either (a .yaml's image is a .pgm, a scaled one a .png).
 
-    Both or neither: after a power failure the .yaml still names an image that belongs to it, perhaps one of a temporary
+    Both or neither: after a power failure the .yaml still names an image that belongs to it, perhaps one with a
+    temporary
     name.
 
     trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
     are transparent and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
-    and raw maps are read back exactly. negate: white is occupied. Raises MapFileError about an empty map, an unknown
-    mode or ending, or an unwritable place.
+    and raw maps are read back exactly. negate: white is occupied. Raises MapFileError for an empty map, an unknown
+    mode or ending, or an unwritable path.
     """
     yaml, image = _files(Path(path), mode)
     png = image.suffix.lower() == ".png"
@@ -84,7 +85,7 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
     pixels = _through(255 - greys if negate else greys, shown)
     opaque = shown >= 0 if mode == "scale" else None
     spare = image.with_name(f".{image.name}")
-    # They take their places from the last to the first: so whenever it ends, a .yaml names a picture of its own.
+    # Renamed from the last to the first: so at any moment the .yaml names its own picture.
     with (
         replacing(yaml) as text,
         replacing(image) as picture,
@@ -99,7 +100,7 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
             else:
                 write_pgm(file, pixels, f"CREATOR: stereovox {grid.resolution:.3f} m/pix")
         for file in (text, picture, text_between):
-            file.flush()  # a full disk shows before the first of them is in its place
+            file.flush()  # a full disk shows before the first of them is renamed
     spare.unlink(missing_ok=True)
 
 
@@ -156,7 +157,7 @@ def read_metadata(path: Path) -> Metadata:
     try:
         if path.is_dir():
             raise MapFileError(
-                f"{path}: no map of a floor; make one of a map in space: stereovox export {path} floor.yaml"
+                f"{path}: not a map of a floor; make one from a map in space: stereovox export {path} floor.yaml"
             )
         if not path.is_file():
             raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
@@ -166,7 +167,7 @@ def read_metadata(path: Path) -> Metadata:
     except MapFileError:
         raise
     except ValueError as error:
-        raise MapFileError(f"{path}: is no YAML ({str(error)[:200]})") from None
+        raise MapFileError(f"{path}: is not YAML ({str(error)[:200]})") from None
     if not isinstance(fields, dict) or not any(name in fields for name in NEEDED):
         raise MapFileError(f"{path}: is not the .yaml of a map_server map")
     return _checked(path, fields)
@@ -176,8 +177,8 @@ def read_metadata(path: Path) -> Metadata:
 class Picture:
     """An image with its top row first; all arrays (height, width).
 
-    brightness: uint8 or float64, mean of the colours, from 0 (black) to 255. see_through: bool, where any background
-    shows through; None: nowhere. with_opacity: float64, mean of the colours and the opacity; None without opacity.
+    brightness: uint8 or float64, mean of the colours, from 0 (black) to 255. see_through: bool, transparent
+    pixels; None: none. with_opacity: float64, mean of the colours and the opacity; None without opacity.
     """
 
     brightness: NDArray[Any]
@@ -186,12 +187,12 @@ class Picture:
 
 
 def read_picture(path: Path) -> Picture:
-    """Return the picture in a file. Raises MapFileError: missing, damaged, too large or no picture."""
+    """Return the picture in a file. Raises MapFileError if it is missing, damaged, too large or not a picture."""
     try:
         if not path.is_file():
             raise MapFileError(f"{path}: no such picture; the map's .yaml names it as its image")
         if path.stat().st_size > MAX_BYTES:
-            raise MapFileError(f"{path}: larger than {MAX_BYTES} bytes; no map is")
+            raise MapFileError(f"{path}: larger than {MAX_BYTES} bytes, too large for a map")
         with path.open("rb") as file:
             kind = file.read(2)
         return Picture(_read_pgm(path)) if kind in (b"P5", b"P2") else _read_with_pillow(path)
@@ -207,7 +208,7 @@ def write_pgm(file: IO[bytes], pixels: NDArray[np.uint8], comment: str) -> None:
 
 
 def write_png(file: IO[bytes], pixels: NDArray[np.uint8], opaque: NDArray[np.bool_] | None) -> None:
-    """Write (height, width) uint8 grey pixels as a PNG; as RGBA, like nav2_map_server, where `opaque` is given."""
+    """Write (height, width) uint8 grey pixels as a PNG; as RGBA, like nav2_map_server, if `opaque` is given."""
     from PIL import Image
 
     if opaque is not None:
@@ -240,21 +241,21 @@ def _checked(path: Path, fields: dict[Any, Any]) -> Metadata:
 
 def _number(path: Path, name: str, value: Any) -> float:
     try:
-        number = float(value)  # text too: YAML takes 1e-5 for such
+        number = float(value)  # strings too: YAML parses 1e-5 as one
     except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not np.isfinite(number):
-        raise MapFileError(f"{path}: {name} {shown(value)} is no number")
+        raise MapFileError(f"{path}: {name} {shown(value)} is not a number")
     return number
 
 
 def _plain(number: float) -> str:
-    """Return a number in full and without exponent, which YAML would take for text."""
+    """Return a number in full and without exponent, which YAML would parse as a string."""
     return np.format_float_positional(float(number), trim="0")
 
 
 def _quoted(name: str) -> str:
-    """Return a file name as YAML takes it for text, whatever is in it."""
+    """Return any file name as a YAML string."""
     import yaml
 
     return yaml.safe_dump(name, allow_unicode=True, width=10**6).removesuffix("\n").removesuffix("\n...")
@@ -266,7 +267,7 @@ def _read_pgm(path: Path) -> NDArray[Any]:
     for _ in range(3):
         found = _NUMBER.match(data, at)
         if not found:
-            raise _damaged(path, "its header is no PGM's")
+            raise _damaged(path, "its header is not a PGM's")
         numbers.append(int(found[1]))
         at = found.end()
     width, height, white = numbers
@@ -276,7 +277,7 @@ def _read_pgm(path: Path) -> NDArray[Any]:
     read = _words if data[:2] == b"P2" else _bytes
     pixels = read(data, at, width * height, white)
     if len(pixels) < width * height:
-        raise _damaged(path, f"it holds no {width} x {height} pixels")
+        raise _damaged(path, f"it has fewer than {width} x {height} pixels")
     pixels = pixels.reshape(height, width)
     return pixels if white == WHITE else np.minimum(pixels, white) * (WHITE / white)
 
@@ -290,7 +291,7 @@ def _bytes(data: bytes, at: int, count: int, white: int) -> NDArray[Any]:
 def _words(data: bytes, at: int, count: int, white: int) -> NDArray[Any]:
     text = re.sub(rb"#[^\n\r]*", b"", data[at:])
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # what is no number, NumPy only warns of
+        warnings.simplefilter("error")  # NumPy only warns of invalid numbers
         try:
             numbers = np.fromstring(text.decode("ascii"), np.int64, sep=" ")[:count]
         except (DeprecationWarning, ValueError):
@@ -342,7 +343,7 @@ def _check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> 
 
 
 def _damaged(path: Path, why: str) -> MapFileError:
-    return MapFileError(f"{path}: damaged or no picture ({why}); save the map anew")
+    return MapFileError(f"{path}: damaged or not a picture ({why}); save the map again")
 
 
 def _cells(picture: Picture, metadata: Metadata) -> NDArray[np.int8]:
@@ -354,7 +355,7 @@ def _cells(picture: Picture, metadata: Metadata) -> NDArray[np.int8]:
 
 
 def _through(table: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.uint8]:
-    """Map each byte through a table of 256 bytes: four times faster than indexing."""
+    """Map each byte through a table of 256 bytes, four times as fast as indexing."""
     return np.frombuffer(cells.tobytes().translate(table.tobytes()), np.uint8).reshape(cells.shape)
 
 
@@ -372,7 +373,7 @@ def _percent(brightness: NDArray[Any], see_through: NDArray[np.bool_] | None, me
 
 
 def _greys(grid: OccupancyGrid, mode: str) -> tuple[NDArray[np.uint8], float, float]:
-    """Return the grey (256,) of each value of a cell read as uint8, and the thresholds: occupied above, free below."""
+    """Return the grey (256,) of each cell value read as uint8, and the thresholds: occupied above, free below."""
     percent = np.arange(256, dtype=np.uint8).view(np.int8)
     known = percent >= 0
     if mode == "raw":
@@ -399,7 +400,7 @@ def _check(grid: OccupancyGrid, image: Path, mode: str, negate: bool) -> None:
 def _files(path: Path, mode: str) -> tuple[Path, Path]:
     """Return .yaml and picture."""
     if mode not in MODES:
-        raise MapFileError(f"{path}: no mode '{mode}'{did_you_mean(mode, MODES)}")
+        raise MapFileError(f"{path}: unknown mode '{mode}'{did_you_mean(mode, MODES)}")
     ending = path.suffix.lower()
     if ending in (".yaml", ".yml"):
         return path, path.with_suffix(".png" if mode == "scale" else ".pgm")
@@ -415,5 +416,5 @@ def _yaml_of(path: Path) -> Path:
     if not path.is_file():
         raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
     if not there:
-        raise MapFileError(f"{path}: no {path.stem}.yaml next to it, which tells what its greys mean")
+        raise MapFileError(f"{path}: no {path.stem}.yaml next to it, which defines what its greys mean")
     return there[0]

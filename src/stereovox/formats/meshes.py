@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 GROUP = 8
 """Blocks along each side of the cubes in which the map is processed."""
 MIN_OFFSET = 0.05
-"""Smallest distance of a vertex from a cell centre, as a share of the way to the next centre."""
+"""Smallest distance of a vertex from a cell centre, as a share of the distance to the next centre."""
 SPAN = 1 << 21
-"""Corners of cells on each axis that three of them fit into one int64."""
+"""Most corners of cells on an axis, so that three coordinates fit into one int64."""
 TRIANGLES = ((0, 1, 2), (0, 2, 3))
 TITLE = "stereovox: surface of occupied cells, metres"
 STL_TITLE_BYTES = 80
@@ -47,7 +47,7 @@ def surface(voxel_map: VoxelMap) -> Mesh:
     """Extract the closed surface around the occupied cells: every occupied centre is inside, every other outside.
 
     Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface is where the log-odds,
-    linear between neighbouring cell centres, cross `map.occupied_above`. Unknown cells count as surely free, so that
+    linear between neighbouring cell centres, cross `map.occupied_above`. Unknown cells count as certainly free, so that
     nothing is invented: towards them the surface reaches no farther than the occupied cell's own face. A wall seen from
     one side still has two sides: it is as thick as its cells.
 
@@ -89,8 +89,8 @@ class Mesh:
 def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the outer faces of the occupied cells, coloured by height; glTF's y is the map's `up`, units are metres.
 
-    Vertices are in the map's own frame, a node turns them. Raises MapFileError for a map without occupied cells and
-    for a place that cannot be written.
+    Vertices are in the map's own frame; a node rotates them. Raises MapFileError if the map has no occupied cells or
+    the file cannot be written.
     """
     from trimesh import Scene
     from trimesh.exchange.gltf import export_glb
@@ -115,7 +115,7 @@ def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
 def write_obj(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the surface around the occupied cells (`surface`) as text: metres, in the map's own frame.
 
-    Raises MapFileError for a map without occupied cells and for an unwritable place, MissingExtra without scikit-image.
+    Raises MapFileError if no cell is occupied or the file cannot be written, MissingExtra without scikit-image.
     """
     from trimesh.exchange.obj import export_obj
 
@@ -138,7 +138,7 @@ def write_stl(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def cube_faces(voxel_map: VoxelMap) -> Mesh:
-    """Return each face between an occupied cell and one that is not, as two triangles; equal corners are one vertex.
+    """Return each face between an occupied cell and any other, as two triangles; equal corners are one vertex.
 
     Raises StereovoxError for a map that is too wide.
     """
@@ -146,7 +146,7 @@ def cube_faces(voxel_map: VoxelMap) -> Mesh:
     lowest = cells.min(axis=0) - 1 if len(cells) else np.zeros(3, np.int64)
     cells = cells - lowest
     if len(cells) and cells.max() + 1 >= SPAN:
-        raise StereovoxError(f"a map of more than {SPAN - 2} cells in a row has no picture; crop it")
+        raise StereovoxError(f"a map of more than {SPAN - 2} cells in a row cannot be drawn; crop it")
     present = np.sort(_codes(cells))
     quads = [_quads(cells, present, axis, side) for axis in range(3) for side in (0, 1)]
     corners = np.concatenate([np.zeros((0, 4, 3), np.int64), *quads])
@@ -157,7 +157,7 @@ def cube_faces(voxel_map: VoxelMap) -> Mesh:
 
 
 def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-    """Yield vertices (n, 3) in cells, 0 in the middle of cell 0, and faces (m, 3) of each cube of blocks."""
+    """Yield vertices (n, 3) in cells, with 0 at the centre of cell 0, and faces (m, 3) of each cube of blocks."""
     try:
         from skimage.measure import marching_cubes
     except ImportError:
@@ -170,7 +170,7 @@ def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[n
 
 
 def _groups(voxel_map: VoxelMap) -> NDArray[np.int32]:
-    """Return the lowest blocks (n, 3) of all cubes of blocks that the surface may pass."""
+    """Return the lowest blocks (n, 3) of all cubes of blocks that the surface may cross."""
     rules, found = CellRules(voxel_map.config.map), [np.empty((0, 3), np.int32)]
     for coords, cells in voxel_map.storage.slabs():
         found.append(coords[(rules.states(cells) == State.OCCUPIED).any(axis=1)])
@@ -193,9 +193,9 @@ def _field(voxel_map: VoxelMap, corner: NDArray[np.int32]) -> NDArray[np.float32
 
 
 def _names(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the edge between cells' middles that each vertex stands on, (N, 3): the same whichever cube it comes from.
+    """Return the edge between cell centres that each vertex is on, (N, 3): the same whichever cube it comes from.
 
-    Twice the place of its middle: so one that stands on no edge, of which a cube has at most one, has its own name.
+    It is twice the edge's midpoint. So a vertex on no edge, of which a cube has at most one, gets its own name.
     """
     whole = np.rint(vertices)
     return (np.where(np.abs(vertices - whole) < MIN_OFFSET / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
@@ -223,7 +223,7 @@ def _places(codes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _linear_colours(heights: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return (N, 4) red, green, blue and opacity; glTF's numbers are linear, those of screens (sRGB) are not."""
+    """Return (N, 4) red, green, blue and opacity; glTF's colours are linear, those of screens (sRGB) are not."""
     screen = height_colours(heights) / 255
     linear = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
     return np.column_stack([np.rint(255 * linear), np.full(len(heights), 255)]).astype(np.uint8)
@@ -239,7 +239,7 @@ def _surface(voxel_map: VoxelMap, path: str | Path) -> Trimesh:
 
 
 def _trimesh(mesh: Mesh, visual: TextureVisuals | None = None) -> Trimesh:
-    """Return the mesh as trimesh's, with the same vertices and faces in the same order."""
+    """Return the mesh as trimesh's type, with the same vertices and faces in the same order."""
     from trimesh import Trimesh
 
     return Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)

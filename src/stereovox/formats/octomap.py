@@ -35,11 +35,11 @@ TREE_TITLE = "# Octomap OcTree file"
 TREE_NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 """One node of an `.ot` file; bit i of `children` says that child i exists."""
 COLOUR_NODE = np.dtype([("log_odds", "<f4"), ("colour", "u1", 3), ("children", "u1")])
-"""One node of a ColorOcTree; its colour is not read."""
+"""One node of a ColorOcTree; its colour is ignored."""
 TREES = {"OcTree": TREE_NODE, "1": TREE_NODE, "OcTreeStamped": TREE_NODE, "ColorOcTree": COLOUR_NODE}
 """Nodes of an `.ot` file by its tree type ("1" in files of OctoMap's first years); a `.bt` has the same for all."""
 MAX_BLOCKS = 2**18
-"""Blocks of 8x8x8 cells a file may expand to (134 million cells); one node can claim 35 million million cells."""
+"""Most blocks of 8x8x8 cells a file may expand to (134 million cells); one node can claim 35 million million cells."""
 BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
 """Blocks that any file may expand to, and more per leaf: a file of 40 bytes must not take a second."""
 MAX_LOG_ODDS = 30.0
@@ -48,16 +48,16 @@ OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_
 MAX_HEADER_LENGTH = 1 << 16
 MAX_NODES = 2 * 512 * MAX_BLOCKS
 MAX_BYTES = 8 * MAX_NODES
-"""A tree of so many cells has fewer nodes and bytes."""
+"""A tree of that many cells has fewer nodes and bytes."""
 
 
 def read_octomap(path: str | Path) -> VoxelMap:
-    """Return the map in an OctoMap file of one of the tree types `TREES`; pruned nodes become the cells they stand for.
+    """Return the map in an OctoMap file of one of the tree types `TREES`; pruned nodes expand to their cells.
 
     `.bt` cells get OctoMap's own clamping limits (log-odds -2 and 3.5). `.ot` cells keep their log-odds to the nearest
     thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known". The map's settings are the
-    default profile's with the file's voxel size, OctoMap's prior of 0.5, and limits that hold the file's values.
-    Raises MapFileError: one line with the file and what is wrong.
+    default profile's with the file's voxel size, OctoMap's prior of 0.5, and limits that include the file's values.
+    Raises MapFileError: one line with the file and the problem.
     """
     content = _read(Path(path))
     try:
@@ -72,7 +72,7 @@ def read_octomap(path: str | Path) -> VoxelMap:
 def write_bt(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the map as OctoMap's binary tree; see `binary_tree`.
 
-    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
+    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or an unwritable path.
     """
     _write(path, BINARY_TITLE, voxel_map, binary_tree(voxel_map))
 
@@ -80,16 +80,16 @@ def write_bt(voxel_map: VoxelMap, path: str | Path) -> None:
 def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the map as OctoMap's full tree; see `full_tree`.
 
-    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
+    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or an unwritable path.
     """
     _write(path, TREE_TITLE, voxel_map, full_tree(voxel_map))
 
 
 def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None, tree: str = "OcTree") -> VoxelMap:
-    """Return the map in the nodes `body` of a tree, those of BINARY_TITLE or of TREE_TITLE.
+    """Return the map in the nodes `body` of a tree with the title BINARY_TITLE or TREE_TITLE.
 
-    voxel_size: metres. size: how many nodes there should be, if that is known. tree: its type, one of `TREES`.
-    Raises ValueError for damaged nodes, ConfigError for a size that no cell can have.
+    voxel_size: metres. size: expected number of nodes, if known. tree: its type, one of `TREES`.
+    Raises ValueError for damaged nodes, ConfigError for an impossible cell size.
     """
     config = load_config(voxel_size=voxel_size, **OCTOMAP)
     kind = TREES[_tree(tree)]
@@ -139,7 +139,7 @@ class Nodes:
     """Nodes of one or more levels, in ascending order.
 
     codes: (n,) uint64 Morton code of the node within its level (x lowest, then y, then z).
-    values: (n,) float32, of a branch the largest value below it.
+    values: (n,) float32, for a branch the largest value below it.
     children: (n,) uint16, two bits a child (child 0 lowest): 0 none, `FREE` (value < 0), `OCCUPIED` or `BRANCH`;
     0 marks a leaf.
     """
@@ -190,7 +190,7 @@ def morton_codes(indices: NDArray[np.integer]) -> NDArray[np.uint64]:
 
 @lru_cache
 def _spread_table() -> NDArray[np.uint64]:
-    """Every 16-bit number with two empty bits before each bit."""
+    """Return every 16-bit number with two empty bits before each bit."""
     numbers = np.arange(2 * KEY_ZERO, dtype=np.uint64)
     spread = np.zeros_like(numbers)
     for bit in range(DEPTH):
@@ -199,7 +199,7 @@ def _spread_table() -> NDArray[np.uint64]:
 
 
 def _one_level_up(level: Nodes) -> tuple[Nodes, NDArray[np.bool_]]:
-    """Return the parents of a level's nodes, and which of the nodes last: eight equal leaves become their parent."""
+    """Return the parents of a level's nodes, and which nodes remain: eight equal leaves merge into their parent."""
     if not len(level):
         return level, np.zeros(0, bool)
     codes = level.codes >> np.uint64(3)
@@ -218,14 +218,14 @@ def _as_children(level: Nodes) -> NDArray[np.uint16]:
 
 
 def _with_sort_keys(level: Nodes, height: int) -> Nodes:
-    """Replace codes by numbers that order nodes of all levels: by their lowest cell, then parents before children."""
+    """Replace codes by keys that order nodes of all levels: by their lowest cell, then parents before children."""
     keys = level.codes << np.uint64(3 * height + 5) | np.uint64(DEPTH - height)
     return Nodes(keys, level.values, level.children)
 
 
 def _write(path: str | Path, title: str, voxel_map: VoxelMap, tree: Tree) -> None:
     if not tree.size:
-        raise MapFileError(f"{path}: the map holds no cell that such a file knows, there is nothing to write")
+        raise MapFileError(f"{path}: the map holds no cell that this format can store, there is nothing to write")
     lines = [
         title,
         "# (feel free to add / change comments, but leave the first line as it is!)",
@@ -255,7 +255,7 @@ def _read(path: Path) -> bytes:
 
 
 def _split(content: bytes) -> tuple[str, dict[str, str], bytes]:
-    """Return the title, the words of the header by their name, and the bytes of the tree."""
+    """Return the title, the fields of the header by name, and the bytes of the tree."""
     title, _, rest = content[:MAX_HEADER_LENGTH].partition(b"\n")
     known = next((t for t in (BINARY_TITLE, TREE_TITLE) if title.startswith(t.encode())), None)
     if known is None:
@@ -333,7 +333,7 @@ def _checked_size(size: int | None, found: int, length: int) -> int:
     if found > MAX_NODES:
         raise ValueError(f"its {found} nodes are more than {MAX_NODES}")
     if size not in (None, found):
-        raise ValueError(f"its header says {size} nodes, its {length} bytes of data hold {found}")
+        raise ValueError(f"its header declares {size} nodes, its {length} bytes of data hold {found}")
     return found
 
 
@@ -342,7 +342,7 @@ def _room_for(size: int) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
 
 
 def _with_limits(config: Config, log_odds: NDArray[np.float32]) -> Config:
-    """Widen the clamping limits where the file's values lie beyond them."""
+    """Widen the clamping limits if the file's values exceed them."""
     if not len(log_odds):
         return config
     lowest = max(min(config.map.log_odds_min, float(log_odds.min())), -MAX_LOG_ODDS)
@@ -353,7 +353,7 @@ def _with_limits(config: Config, log_odds: NDArray[np.float32]) -> Config:
 def _map_of(leaves: _Leaves, config: Config) -> VoxelMap:
     room, most = _blocks_of(leaves), min(MAX_BLOCKS, max(BLOCKS_OF_ANY, BLOCKS_A_LEAF * len(leaves.heights)))
     if room > most:
-        raise ValueError(f"its nodes stand for up to {room * 512:.3g} cells, more than {most * 512:.3g}")
+        raise ValueError(f"its nodes expand to up to {room * 512:.3g} cells, more than {most * 512:.3g}")
     coords, values = np.zeros((room, 3), np.int32), np.zeros((room, 512), np.int16)
     limits = config.map
     units = to_units(np.clip(leaves.log_odds, limits.log_odds_min, limits.log_odds_max)).astype(np.int16)
@@ -365,7 +365,7 @@ def _map_of(leaves: _Leaves, config: Config) -> VoxelMap:
 
 
 def _blocks_of(leaves: _Leaves) -> int:
-    """Count blocks: a leaf as high as a block or higher fills its own, lower ones share with their neighbours."""
+    """Count blocks: a leaf at least as high as a block fills its own; lower ones share with their neighbours."""
     height = _octree.BLOCK_HEIGHT
     large = leaves.heights >= height
     places = (leaves.corners[~large] >> height).astype(np.int64)

@@ -31,7 +31,7 @@ HEIGHT_RAMP = ((40, 60, 180), (30, 160, 210), (70, 190, 90), (240, 200, 50), (20
 def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells as a binary point cloud: centre in metres (world frame), colour by height, probability.
 
-    Raises MapFileError when the place cannot be written.
+    Raises MapFileError if the file cannot be written.
     """
     points, colours = _occupied(voxel_map, PLY_POINT)
     for channel, name in enumerate(("red", "green", "blue")):
@@ -73,7 +73,7 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def cell_colours(voxel_map: VoxelMap, centers: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the `height_colours` (N, 3) of places (N, 3) in metres, whichever axis of the map is up."""
+    """Return the `height_colours` (N, 3) of points (N, 3) in metres, whichever axis of the map is up."""
     return height_colours(heights_of(centers, voxel_map.config.up))
 
 

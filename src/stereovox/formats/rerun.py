@@ -35,7 +35,7 @@ MAX_POINTS = 20_000
 WIDEST_PX = 320
 """Most columns of a depth image; larger ones are thinned."""
 REWRITE_RATIO = 25
-"""The map is written again only after this many times as long as writing it took."""
+"""Least time between two writes of the map, as a multiple of the time one takes."""
 PATH_COLOUR = (224, 69, 47)
 
 
@@ -43,7 +43,7 @@ PATH_COLOUR = (224, 69, 47)
 def write_rrd(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells, the cameras' path, and the camera along it over time, for the Rerun viewer.
 
-    Raises MissingExtra without rerun, MapFileError when the place cannot be written.
+    Raises MissingExtra without rerun, MapFileError if the file cannot be written.
     """
     with rerun_file(path, voxel_map.config.up) as file:
         file.add_map(voxel_map)
@@ -90,7 +90,7 @@ class RerunFile:
         self._stream.log(PATH, way, static=stamp_ns is None)
 
     def add_camera(self, camera: PinholeCamera | None, T_world_camera: Transform, stamp_ns: int) -> None:
-        """Add where a camera stood at a time."""
+        """Add a camera's pose at a time."""
         self._at(stamp_ns)
         pose = self._rerun.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3])
         self._stream.log(CAMERA, pose)
@@ -109,7 +109,7 @@ class RerunFile:
         self._stream.log(f"{CAMERA}/depth", self._rerun.DepthImage(millimetres, meter=1000.0))
 
     def add_cloud(self, cloud: CheckedCloud) -> None:
-        """Add the points of a cloud and where its sensor was."""
+        """Add the points of a cloud and the pose of its sensor."""
         viewpoint = cloud.viewpoint
         self.add_camera(None, viewpoint.T_world_camera, cloud.stamp_ns)
         T = cloud.T_world_sensor

@@ -39,11 +39,11 @@ SENSOR: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -4.0, "map.log_o
 HIT, MISS = 1386, -944
 """Log-odds in thousandths, of p = 0.8 and 0.28: one scan is enough to make a cell occupied or free."""
 STEPS_OF_ANY, STEPS_A_POINT, MAX_STEPS = 1 << 19, 10_000, 1 << 31
-"""Cells along all rays together: of any graph, more for each of its points, and never more than these."""
+"""Cells along all rays together: allowed for any graph, more for each of its points, and the upper limit."""
 BLOCK_BYTES = 1024
 MAX_PLACE = 1e9
 ANY = Lidar(range_min=0.0)
-"""Nothing is known of the sensor."""
+"""The sensor is unknown."""
 
 
 class Scan(NamedTuple):
@@ -54,10 +54,10 @@ class Scan(NamedTuple):
 
 
 def read_scan_graph(path: str | Path, voxel_size: float | None = None) -> VoxelMap:
-    """Return the map of a scan graph: in each scan, cells with points are hit, the others on the way to them passed.
+    """Return the map of a scan graph: in each scan, cells with points are hit, others along the rays are missed.
 
-    voxel_size: metres; None: one suggested. A cell that one scan passes is free and one that it hits occupied; where
-    scans contradict each other their log-odds add up. Raises MapFileError: one line with the file and what is wrong,
+    voxel_size: metres; None: a suggested one. A cell that one scan misses is free, one that it hits is occupied; if
+    scans contradict each other, their log-odds add up. Raises MapFileError: one line with the file and the problem,
     also for scans that a mapper would refuse as clouds (`checked_cloud`).
     """
     try:
@@ -69,7 +69,7 @@ def read_scan_graph(path: str | Path, voxel_size: float | None = None) -> VoxelM
 
 
 def read_scans(path: str | Path) -> list[Scan]:
-    """Return the scans of a graph; raises MapFileError: one line with the file and what is wrong."""
+    """Return the scans of a graph; raises MapFileError: one line with the file and the problem."""
     try:
         content = read_bounded(Path(path), MAX_BYTES)
         text = TITLE.search(content[:4096]) or content.lstrip().startswith((b"#", b"NODE"))
@@ -78,7 +78,7 @@ def read_scans(path: str | Path) -> list[Scan]:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a scan graph") from None
     except (ValueError, OverflowError, struct.error) as error:
         why = " ".join(str(error).split())[:120]
-        raise MapFileError(f"{path}: no OctoMap scan graph, or a damaged one ({why}); write it again") from None
+        raise MapFileError(f"{path}: not an OctoMap scan graph, or damaged ({why}); write it again") from None
     if not sum(len(scan.points) for scan in scans):
         raise MapFileError(f"{path}: its {len(scans)} scans hold no point; write it again with its scans")
     return scans
@@ -92,7 +92,7 @@ def _map_of(scans: list[Scan], name: str, voxel_size: float | None) -> VoxelMap:
         suggested = suggested_cell(np.concatenate(world))
         if suggested is None:
             raise StereovoxError(
-                f"too few points for a size of cells; type: stereovox import {name} MAP --voxel-size 0.05"
+                f"too few points to determine a cell size; type: stereovox import {name} MAP --voxel-size 0.05"
             )
         size = suggested.voxel_size
         notes = (f"cells of {size:g} m, {suggested.why} (--voxel-size overrides)",)
@@ -118,12 +118,12 @@ def _binary_scans(content: bytes) -> Iterator[Scan]:
     at = 4
     for _ in range(number):
         (count,) = struct.unpack_from("<I", content, at)
-        records = np.frombuffer(content, POINT, count, at + 4)  # ValueError if they are not there
+        records = np.frombuffer(content, POINT, count, at + 4)  # ValueError if they are missing
         at += 4 + records.nbytes
         three, x, y, z, four, qw, qx, qy, qz = POSE.unpack_from(content, at)
         at += POSE.size + 4
         if (three, four) != (3, 4) or (count and (records["size"] != 3).any()):
-            raise ValueError("coordinates do not come in threes")
+            raise ValueError("coordinates are not in threes")
         yield _checked((x, y, z), (qx, qy, qz, qw), records["xyz"])
 
 
@@ -159,10 +159,10 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, ...]:
 
 
 def _checked(place: tuple[float, ...], quaternion_xyzw: tuple[float, ...], points: NDArray[np.float64]) -> Scan:
-    """Return a scan; raises ValueError for a pose that is none. Points that are not finite are left out."""
+    """Return a scan; raises ValueError for an invalid pose. Non-finite points are left out."""
     numbers = np.array([*place, *quaternion_xyzw])
     if not (np.isfinite(numbers).all() and np.abs(numbers).max() < MAX_PLACE and np.linalg.norm(numbers[3:]) > 1e-6):
-        raise ValueError(f"pose {shown(numbers.tolist())} is none")
+        raise ValueError(f"pose {shown(numbers.tolist())} is invalid")
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) and np.abs(finite).max() > MAX_PLACE:
         raise ValueError(f"a point {np.abs(finite).max():.3g} m from its sensor")

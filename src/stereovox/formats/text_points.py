@@ -16,7 +16,7 @@ from stereovox.files.safe_io import read_text, shown
 
 MAX_BYTES = 1 << 30
 HEAD = 1 << 16
-"""Characters in which the first line with numbers lies."""
+"""Characters that must contain the first line with numbers."""
 COMMENTS = ("#", "//")
 SEPARATORS = (",", ";", "\t")
 NAME = re.compile(r"[a-z]+")
@@ -26,7 +26,7 @@ def read_text_points(path: str | Path) -> NDArray[np.float64]:
     """Return points (N, 3): the columns named x, y and z, else the first three.
 
     Columns are separated by commas, semicolons or blanks; `#` and `//` begin comments, which may name the columns; a
-    first line with one number alone counts the points. Raises MapFileError: one line with the file and what is wrong.
+    first line with a single number counts the points. Raises MapFileError: one line with the file and the problem.
     """
     try:
         text = read_text(Path(path), MAX_BYTES)
@@ -38,17 +38,17 @@ def read_text_points(path: str | Path) -> NDArray[np.float64]:
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
     except UnicodeError:
-        raise MapFileError(f"{path}: is no text; give it the ending of what it is, .ply, .pcd or .las") from None
+        raise MapFileError(f"{path}: is not text; give it its real ending, .ply, .pcd or .las") from None
     except (ValueError, OverflowError) as error:
         why = " ".join(str(error).split())[:120]
-        raise MapFileError(f"{path}: no points that can be read: {why}; write x y z a line") from None
+        raise MapFileError(f"{path}: no readable points: {why}; write x y z a line") from None
     if not len(table):
         raise MapFileError(f"{path}: holds no point; write x y z a line")
     return table
 
 
 def _layout(text: str) -> tuple[int, str | None, tuple[int, ...]]:
-    """Return where the numbers begin, what separates them, and which columns are x, y and z.
+    """Return the offset of the numbers, their separator, and which columns are x, y and z.
 
     Raises ValueError if no line holds three numbers.
     """
@@ -60,7 +60,7 @@ def _layout(text: str) -> tuple[int, str | None, tuple[int, ...]]:
             return start, separator, columns
         named = _named(words) or named
         if words and not line.lstrip().startswith(COMMENTS) and _named(words) is None and not _is_count(words):
-            raise ValueError(f"a line {shown(line.strip())} with no columns x, y and z")
+            raise ValueError(f"a line {shown(line.strip())} without columns x, y and z")
         start += len(line)
     raise ValueError("no line of three numbers")
 

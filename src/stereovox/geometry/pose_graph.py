@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose graphs: the poses that explain best where pairs of them stand to each other, and how well these are known.
+"""Pose graphs: the poses that best explain measured relative poses, and their uncertainty.
 
-gtsam (Dellaert and contributors) solves them. Motions are of a kind: (3,) x, y, yaw in the plane, (4, 4) in space;
-covariances are those of a small motion (3,) x, y, yaw or (6,) rotation, shift, in the second pose's own axes.
+gtsam (Dellaert and contributors) solves them. Motions are (3,) x, y, yaw in the plane or (4, 4) in space;
+covariances are for a small motion (3,) x, y, yaw or (6,) rotation, translation, in the second pose's own axes.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import MissingExtra, StereovoxError
 
 OUTLIER = 3.0
-"""Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
+"""Standard deviations from which a robust edge pulls less and less (Cauchy)."""
 HELD = 1e-4
-"""Metres and radians by which the first pose may move, usually."""
+"""Default deviation of the first pose, in metres and radians."""
 LITTLE = 1e-3
-"""Information that is added to that of each edge, which may say nothing of a direction, as along a corridor."""
+"""Information added to each edge, which may constrain nothing in some direction, as along a corridor."""
 MAX_ITERATIONS = 50
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """How two poses stand to each other: `motion` is T_first_second; information: inverse of its covariance."""
+    """The relative pose of two poses: `motion` is T_first_second; information: inverse of its covariance."""
 
     first: int
     second: int
@@ -44,7 +44,7 @@ def information(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Which way is up as seen from a pose: a unit vector (3,) in its axes, and its standard deviation in radians."""
+    """The measured up direction at a pose: a unit vector (3,) in its axes, and its standard deviation in radians."""
 
     pose: int
     up: NDArray[np.float64]
@@ -53,7 +53,7 @@ class Upright:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Where a pose is by something that does not drift (GNSS): (3,) metres in the graph's world, and the deviations."""
+    """A drift-free position of a pose (GNSS): (3,) metres in the graph's world, and its standard deviations."""
 
     pose: int
     place: NDArray[np.float64]
@@ -61,22 +61,22 @@ class Position:
 
 
 class PoseGraph:
-    """Poses that are solved for.
+    """A pose graph and its solution.
 
     Args:
-        poses: (N, 3) or (N, 4, 4), where the search begins.
-        steps: Edges that are surely right.
-        loops: Edges any of which may be wrong; they are weighted by Cauchy's function.
-        others: What else is known of poses in space.
-        world_up: (3,) unit vector, where `others` say which way is up.
-        held: Standard deviation in metres and radians that holds the first pose where it is.
+        poses: (N, 3) or (N, 4, 4) initial values.
+        steps: Edges that are certainly right.
+        loops: Edges of which any may be wrong; Cauchy's function weights them.
+        others: Other measurements of poses in space.
+        world_up: (3,) unit vector; used if `others` hold up directions.
+        held: Standard deviation in metres and radians that holds the first pose in place.
 
     Attributes:
-        poses: The poses that explain all best, of the same shape.
+        poses: The best poses, of the same shape.
 
     Raises:
         MissingExtra: gtsam is not installed.
-        StereovoxError: What joins the poses cannot be solved for, since some of it is known far better than the rest.
+        StereovoxError: The graph cannot be solved, since some constraints are far tighter than others.
     """
 
     def __init__(
@@ -111,10 +111,10 @@ class PoseGraph:
         self.poses = np.array([_numbers(at(i)) for i in range(len(poses))])
 
     def covariances(self, firsts: Sequence[int], second: int) -> list[NDArray[np.float64]]:
-        """Return how well it is known where a pose stands as seen from each of others: covariances of T_first_second.
+        """Return the uncertainty of a pose relative to each of several others: covariances of T_first_second.
 
         Args:
-            firsts: Numbers of the others.
+            firsts: Numbers of the other poses.
             second: Number of the pose.
 
         Returns:
@@ -162,7 +162,7 @@ def _numbers(pose: Any) -> Any:
 
 @contextmanager
 def _solvable() -> Iterator[None]:
-    """Say in one line what gtsam says in a paragraph."""
+    """Replace gtsam's paragraph by one line."""
     try:
         yield
     except RuntimeError as error:
@@ -175,7 +175,7 @@ def _solvable() -> Iterator[None]:
 
 
 def need_gtsam() -> None:
-    """Raise MissingExtra if gtsam is not installed: before the work, not in the middle of it."""
+    """Raise MissingExtra if gtsam is not installed; call it before the work starts."""
     if find_spec("gtsam") is None:
         raise MissingExtra("gtsam", "slam")
 

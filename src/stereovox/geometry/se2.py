@@ -18,7 +18,7 @@ Pose = NDArray[np.float64]
 def wrapped(angle: ArrayLike) -> NDArray[np.float64]:
     """Return angles in radians wrapped into [-pi, pi)."""
     turned = (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
-    return turned - 2 * np.pi * (turned >= np.pi)  # a hair below -pi is rounded up to pi
+    return turned - 2 * np.pi * (turned >= np.pi)  # just below -pi rounds up to pi
 
 
 def compose(pose_a_b: ArrayLike, pose_b_c: ArrayLike) -> Pose:
@@ -40,7 +40,7 @@ def inverse(pose_a_b: ArrayLike) -> Pose:
 
 
 def relative(pose_a_b: ArrayLike, pose_a_c: ArrayLike) -> Pose:
-    """Return pose_b_c: the pose of c as seen from b."""
+    """Return pose_b_c: the pose of c in frame b."""
     return compose(inverse(pose_a_b), pose_a_c)
 
 

@@ -30,7 +30,7 @@ def rigidity_error(T: ArrayLike) -> float:
     T = np.asarray(T)
     if T.shape != (4, 4):
         return np.inf
-    # plain numbers: five times as fast, and every frame is checked
+    # plain numbers are five times as fast, and every frame is checked
     (a, b, c, x), (d, e, f, y), (g, h, i, z), (j, k, m, n) = T.tolist()
     if not (isfinite(x + y + z) and abs(j) + abs(k) + abs(m) + abs(n - 1) <= 1e-6):
         return np.inf
@@ -89,11 +89,11 @@ def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
 
 
 def rotation_between(one: ArrayLike, other: ArrayLike) -> NDArray[np.float64]:
-    """Return the least rotation (3, 3) that turns a unit vector (3,) into another one."""
+    """Return the smallest rotation (3, 3) that turns a unit vector (3,) into another one."""
     a, b = np.asarray(one, float), np.asarray(other, float)
     axis, cosine = np.cross(a, b), float(a @ b)
     sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:  # any axis across serves half a turn
+    if sine < 1e-9:  # for half a turn any perpendicular axis will do
         return rotation_matrix(np.zeros(3)) if cosine > 0 else rotation_matrix(np.pi * _across(a))
     return rotation_matrix(axis * (np.arctan2(sine, cosine) / sine))
 
@@ -104,7 +104,7 @@ def _across(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def interpolate(T_a_b0: Transform, T_a_b1: Transform, share: float) -> Transform:
-    """Return the motion at `share` between two (0 to 1; beyond, it goes on): linear in position, even in turning."""
+    """Return the motion at `share` between two (0 to 1; extrapolated beyond): linear in position and rotation angle."""
     T = np.eye(4)
     R0 = T_a_b0[:3, :3]
     T[:3, :3] = R0 @ rotation_matrix(share * rotation_vector(R0.T @ T_a_b1[:3, :3]))

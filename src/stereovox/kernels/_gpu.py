@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that run on a graphics card, and the cells they share with those for the processor.
+"""Kernels that run on a graphics card, and the cells they share with the processor's kernels.
 
 The body of a `@cell` of `_jit.py` is plain Python: `on_gpu` compiles it for the card, with all cells that it calls. So
-no formula is written twice. Only files that are imported when a card is asked for import this one.
+no formula is written twice. Only files that are imported when a card is requested import this one.
 
-Launches have the same size whatever there is to do; each kernel loops over its work in strides of the whole grid. So
-the number of things to do may stand on the card, and the processor need not wait for it.
+Launches always have the same size; each kernel loops over its work in strides of the whole grid. So
+the amount of work can be stored on the card, and the processor need not wait for it.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from stereovox.kernels import _math
 from stereovox.kernels._jit import with_cache
 
 cuda: Any = numba.cuda
-"""To a type checker numba's module is full of classes that kernels call like functions."""
+"""To a type checker, numba's module is full of classes that kernels call like functions."""
 ENABLE_CUDASIM: bool = vars(config)["ENABLE_CUDASIM"]
 Function = Callable[..., Any]
 
 THREADS = 2 if ENABLE_CUDASIM else 128
 """Threads in a block of each launch."""
 FEWEST_BLOCKS, BLOCKS_PER_PROCESSOR = 128, 8
-"""Blocks of a launch: at least so many, below which numba warns, and for each multiprocessor of the card."""
+"""Blocks of a launch: at least this many, below which numba warns, and this many for each multiprocessor."""
 
 
 def gpu_kernel(function: Function) -> Function:
-    """Compile `function` for the card when it is first launched; `launch` does that. Kept on disk as others are."""
+    """Compile `function` for the card at its first `launch`, and cache it on disk like the other kernels."""
     return with_cache(lambda cache: cuda.jit(function, cache=cache))
 
 
@@ -45,7 +45,7 @@ def gpu_kernel(function: Function) -> Function:
 def on_gpu(cell: Function) -> Function:
     """Return the twin of a `@cell` that kernels for the card can call. The simulator runs it as plain Python.
 
-    Its body is compiled by itself, since the flags of the processor's twin let the card's compiler take it that there
+    Its body is compiled separately, since the flags of the processor's twin let the card's compiler assume that there
     are no NaN and no infinities.
     """
     body = getattr(cell, "py_func", cell)
@@ -60,12 +60,12 @@ def on_gpu(cell: Function) -> Function:
 
 
 def launch(kernel: Function, *arguments: Any) -> None:
-    """Run a kernel on the card; it ends some time before anything is copied from there."""
+    """Run a kernel on the card; it has finished before anything is copied back."""
     kernel[_blocks(), THREADS](*arguments)  # pyright: ignore[reportIndexIssue]
 
 
 def to_gpu(array: Any) -> Any:
-    """Return a copy of an array on the card; of a tuple the same with copies of its arrays."""
+    """Return a copy of an array on the card; for a tuple, a tuple with copies of its arrays."""
     if isinstance(array, tuple):
         parts = [to_gpu(part) if isinstance(part, np.ndarray) else part for part in array]
         return type(array)(*parts) if hasattr(array, "_fields") else tuple(parts)
@@ -73,10 +73,10 @@ def to_gpu(array: Any) -> Any:
 
 
 def gpu_array(shape: int | tuple[int, ...], dtype: Any, value: int | float | None = None) -> Any:
-    """Return an array on the card, filled with `value` if there is one. Raises MemoryError where it has no room."""
+    """Return an array on the card, filled with `value` if given. Raises MemoryError if the card has no room."""
     try:
         array = cuda.device_array(shape, dtype)
-    except Exception as error:  # numba's own class is another one in each of its versions
+    except Exception as error:  # the class differs between versions of numba
         if "OUT_OF_MEMORY" not in str(error).upper().replace(" ", "_"):
             raise
         raise MemoryError(f"the graphics card has no room for an array of shape {shape}") from None
@@ -96,7 +96,7 @@ def unusable() -> str | None:
 
 @gpu_kernel
 def fill(array, value):
-    """Set all of a flat array to `value`."""
+    """Set all elements of a flat array to `value`."""
     for i in range(cuda.grid(1), array.size, cuda.gridsize(1)):
         array[i] = value
 
@@ -122,4 +122,4 @@ else:
         return libdevice.fsqrt_rn(x)
 
     OWN = {_math.floor: _floor, _math.square_root: _square_root}
-"""Cells that the card has functions of its own for, under other names."""
+"""Cells for which the card has its own functions, under other names."""

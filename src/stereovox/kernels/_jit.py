@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decorators for kernels: compile flags, and a disk cache that any change in a kernel file renews.
+"""Decorators for kernels: compile flags, and a disk cache that any change in a kernel file invalidates.
 
-Numba renews a cached kernel when its own file changes but not when a file it calls does; so the cache folder's name
-holds the hash of all kernel files (and of numba's version).
+Numba recompiles a kernel when its own file changes but not when a file it calls does; so the cache folder's name
+contains the hash of all kernel files (and numba's version).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering
 
-# Two things that make kernels fast cannot be had through numba's public options: the promise that arrays do not
-# overlap, and vectors of 512 bits. Both need its private pipeline (numba.core), which any version may change without a
-# word. So pyproject.toml allows just the versions this was tried with; tests/kernels/test_jit.py names what one breaks.
+# Two things that make kernels fast are not available through numba's public options: the promise that arrays do not
+# overlap, and vectors of 512 bits. Both need its private pipeline (numba.core), which any version may change without
+# notice. So pyproject.toml allows only tested versions; tests/kernels/test_jit.py shows what a new one breaks.
 
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""
@@ -34,11 +34,11 @@ Function = Callable[..., Any]
 
 
 class _WideLower(Lower):
-    """Allows 512-bit vectors where the processor has them; by default LLVM uses half of that."""
+    """Allows 512-bit vectors if the processor has them; by default LLVM uses half of that."""
 
     def setup_function(self, fndesc: Any) -> None:
         super().setup_function(fndesc)
-        set.add(self.function.attributes, '"prefer-vector-width"="512"')  # llvmlite knows only attributes without value
+        set.add(self.function.attributes, '"prefer-vector-width"="512"')  # llvmlite rejects attributes with values
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -64,8 +64,8 @@ class _KernelCompiler(CompilerBase):
 def kernel(function: Function) -> Function:
     """Compile `function` to machine code that releases the GIL and is cached on disk.
 
-    An array that a kernel writes must not overlap any other argument. Kernels cannot allocate arrays: then references
-    need not be counted, which in small loops takes longer than the work.
+    An array that a kernel writes must not overlap any other argument. Kernels cannot allocate arrays, so references
+    are not counted, which in small loops takes longer than the work.
     """
     return _compile(function, _nrt=False)
 
@@ -78,8 +78,8 @@ def allocating_kernel(function: Function) -> Function:
 def cell(function: Function) -> Function:
     """Compile a small function that is inlined into every kernel that calls it.
 
-    It must not make or return arrays: then references are not counted, which inside a loop costs more than a hash
-    look-up. Python cannot call it: compiling a wrapper takes as long as compiling the function.
+    It must not make or return arrays, so references are not counted, which inside a loop costs more than a hash
+    look-up. Python cannot call it: compiling a wrapper would take as long as compiling the function.
     """
     return _compile(function, forceinline=True, _nrt=False, no_cpython_wrapper=True)
 
@@ -91,7 +91,7 @@ def exact_cell(function: Function) -> Function:
 
 @lru_cache
 def cache_folder() -> Path | None:
-    """Return the folder of compiled kernels, None if none can be written."""
+    """Return the folder of compiled kernels, None if none is writable."""
     name = f"stereovox-kernels-{_source_hash()}"
     for base in (os.environ.get("STEREOVOX_CACHE"), _user_cache(), tempfile.gettempdir()):
         folder = Path(base) / "stereovox" / name if base else None
@@ -101,7 +101,7 @@ def cache_folder() -> Path | None:
 
 
 def with_cache(compile_it: Callable[[bool], Function]) -> Function:
-    """Return `compile_it(cache)`: whether machine code is kept on disk, in the folder of these kernels."""
+    """Return `compile_it(cache)`; `cache` is whether machine code is kept on disk, in the folder of these kernels."""
     folder = cache_folder()
     settings: Any = numba_config
     before = settings.CACHE_DIR

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that kernels for the processor and for a graphics card call by the same name; see `kernels/_gpu.py`."""
+"""Functions that kernels for processor and graphics card call by the same name; see `kernels/_gpu.py`."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map is made: on the processor, or on a graphics card if there is one that can be used."""
+"""The device that makes a map: the processor, or a graphics card if a usable one exists."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from stereovox.errors import ConfigError
 
 
 def warn(line: str) -> None:
-    """Issue a line as a warning to whoever made the mapper."""
+    """Issue a line as a warning at the caller that made the mapper."""
     warnings.warn(line, RuntimeWarning, stacklevel=4)
 
 
 def on_usable_device(config: Config, notify: Callable[[str], None] = warn) -> Config:
-    """Return the settings with a device that can be used here; `notify` is told why that is another one."""
+    """Return the settings with a usable device; `notify` gets the reason if it is another one."""
     reason = None if config.device == "cpu" else _no_card()
     if reason is None:
         return config
@@ -25,14 +25,14 @@ def on_usable_device(config: Config, notify: Callable[[str], None] = warn) -> Co
 
 
 def check_device() -> None:
-    """Raise ConfigError if no graphics card can be used; for what is made without a mapper."""
+    """Raise ConfigError if no graphics card can be used; for work without a mapper."""
     reason = _no_card()
     if reason is not None:
         raise ConfigError(f'device "cuda": {reason}')
 
 
 def check_on_processor(config: Config) -> None:
-    """Raise ConfigError if the settings are those of a graphics card, on which there are no maps of floors."""
+    """Raise ConfigError if the settings request a graphics card, which does not support maps of floors."""
     if config.device != "cpu":
         raise ConfigError(f'device "{config.device}": maps of floors are made on the processor only; leave it out')
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threads: sharded kernels, locks of maps, steps that Ctrl-C does not cut in half, and jobs of which only the newest
-request counts."""
+"""Threads: sharded kernels, locks of maps, steps that Ctrl-C does not interrupt halfway, and jobs for which only
+the newest request counts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CHANGING = ("_pool", "_times", "history", "kept")
 def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
     """Call `work(part)` for all parts in parallel; the result must not depend on the partition.
 
-    When all are done it returns, or raises what one of them raised.
+    It returns when all are done, and raises the error of one that failed.
     """
     mine, *others = parts
     if not others:
@@ -61,32 +61,33 @@ def run_both(threads: int, first: Callable[[], First], second: Callable[[], Seco
 
 
 class Ahead(Generic[First, Second]):
-    """A function, run by one thread at a time, that can begin in the background before its result is wanted."""
+    """A function, run by one thread at a time, that can start in the background before its result is needed."""
 
     def __init__(self, function: Callable[[First], Second]):
         self._function, self._alone = function, MapLock()
         self._begun: deque[tuple[First, Future[Second]]] = deque(maxlen=2)
 
     def begin(self, argument: First) -> None:
-        """Call the function in the background; a call with this very object will return, or raise, what comes of it.
+        """Call the function in the background; a later call with the same object returns its result or raises its
+        error.
 
-        Of calls whose results are not wanted the last two are remembered. Nothing happens while two have not ended yet:
-        many that wait for one another would take the threads that the first of them may need.
+        Only the last two unclaimed results are kept. Nothing happens while two calls are unfinished:
+        many that wait for one another could occupy the threads that the first of them needs.
         """
         if sum(not result.done() for _, result in tuple(self._begun)) < 2:
             self._begun.append((argument, _pool().submit(self._call, argument)))
 
     def __call__(self, argument: First) -> Second:
         """Return what the function returns."""
-        for begun in tuple(self._begun):  # a copy, since another thread may begin something meanwhile
+        for begun in tuple(self._begun):  # a copy, since another thread may begin a call meanwhile
             if begun[0] is argument:
-                # by identity: arguments, such as frames, may not be comparable
+                # compare by identity: arguments, such as frames, may not be comparable
                 self._begun = deque((one for one in tuple(self._begun) if one is not begun), maxlen=2)
                 return begun[1].result()
         return self._call(argument)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_begun": deque(maxlen=2)}  # a copy begins nothing
+        return {**vars(self), "_begun": deque(maxlen=2)}  # a copy has no pending calls
 
     def _call(self, argument: First) -> Second:
         with self._alone:
@@ -94,9 +95,9 @@ class Ahead(Generic[First, Second]):
 
 
 def expecting(expect: Callable[[First], None], frames: Iterable[First]) -> Iterator[First]:
-    """Yield frames, each once `expect` was called with the one after it.
+    """Yield frames, each after `expect` was called with the next one.
 
-    What the source raises is raised after its last frame, as without this.
+    An error of the source is raised after its last frame, as it would be without this.
     """
     coming = iter(frames)
     frame, failure = next(coming, None), None
@@ -115,14 +116,14 @@ def expecting(expect: Callable[[First], None], frames: Iterable[First]) -> Itera
 
 
 class Scratch(Generic[T]):
-    """Memory for work that threads do at the same time: each borrows one piece, which is made when none is free."""
+    """Memory for work in parallel threads: each borrows one piece; a new one is made if none is free."""
 
     def __init__(self, make: Callable[[], T]):
         self._make = make
         self._free: list[T] = []
 
     def lend(self, work: Callable[[T], None]) -> None:
-        """Call `work` with a piece of memory that nobody else has meanwhile."""
+        """Call `work` with a piece of memory that no other thread uses meanwhile."""
         try:
             piece = self._free.pop()
         except IndexError:
@@ -153,7 +154,7 @@ if hasattr(os, "register_at_fork"):
 class Newest:
     """Runs `job` one at a time; calls that arrive while it runs share the next run.
 
-    For controls of a page, which call from many threads, and sliders that are dragged faster than they are drawn.
+    For controls of a page, which call from many threads, and sliders that move faster than they can be drawn.
     """
 
     def __init__(self, job: Callable[[], None]):
@@ -179,7 +180,7 @@ class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stu
     def refuse_holder(self, what: str = "a frame cannot be added") -> None:
         """Raise StereovoxError if this thread holds the lock: waiting for another lock now could deadlock.
 
-        what: begins the error.
+        what: start of the error message.
         """
         if self._is_owned():  # pyright: ignore[reportAttributeAccessIssue] - threading.Condition uses it too
             raise StereovoxError(
@@ -191,9 +192,9 @@ class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stu
 
 
 class Guarded:
-    """A map whose public methods and properties hold `lock`, so that none sees a change half done.
+    """A map whose public methods and properties hold `lock`, so that none sees a half-finished change.
 
-    Generators hold it only while they make an item (`in_steps`), not while their reader works.
+    Generators hold it only while they make an item (`in_steps`), not while their caller works.
     lock: re-entrant; hold it over several calls that must see the same state.
     """
 
@@ -210,7 +211,7 @@ class Guarded:
                 setattr(cls, name, _locked(value))
 
     def __copy__(self) -> Any:
-        return deepcopy(self)  # two maps must not share cells, each with a lock of its own
+        return deepcopy(self)  # two maps must not share cells while each has its own lock
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         twin = memo[id(self)] = type(self).__new__(type(self))
@@ -240,7 +241,7 @@ def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C wait until what is done here is complete, so that a map is never half changed; it is raised then."""
+    """Delay Ctrl-C until the block is complete, so that a map is never half changed; then raise it."""
     on_main = threading.current_thread() is threading.main_thread()  # others are never interrupted
     if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
@@ -251,7 +252,7 @@ def uninterrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        if received:  # also where what was done here failed
+        if received:  # even if the block failed
             raise KeyboardInterrupt
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse sensor models: the occupancy that a measured depth implies before, at and behind it. Plain NumPy."""
+"""Inverse sensor models: the occupancy that a measured depth implies in front of, at and behind it. Plain NumPy."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of inverse sensor models, and the table that kernels read in their place."""
+"""The protocol of inverse sensor models, and the lookup table that kernels use instead."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 ROWS = 128
 """Table rows: measured depths from 0 to the maximum range."""
 COLUMNS = 128
-"""Table columns: distances from the measurement. Even, so that no column stands exactly on the measurement."""
+"""Table columns: distances from the measurement. Even, so that no column is exactly on the measurement."""
 REACH_SIGMA = 4.0
 """The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
 
@@ -26,7 +26,7 @@ END_SIGMA = REACH_SIGMA * (1 - 1 / COLUMNS)
 FAR_SIGMA = 12.0
 """Distance from a measurement at which a model must have reached p_free and p_unknown."""
 END_TOLERANCE = 0.02
-"""Largest deviation from them there."""
+"""Largest deviation from them at FAR_SIGMA."""
 
 
 class InverseSensorModel(Protocol):
@@ -34,8 +34,8 @@ class InverseSensorModel(Protocol):
 
     The cell that holds the measured point gets `probability` at that point. Two optional methods refine this:
     `hit(z_measured, sigma, voxel_size)` returns the probability of that cell instead, for models that consider its
-    size; `passed(z, sigma, voxel_size)` returns the least probability of a cell at depth `z` that is looked through,
-    where that must stay above p_free, since an object in it may be thinner than a pixel.
+    size; `passed(z, sigma, voxel_size)` returns a lower bound for a cell at depth `z` that a ray passes through,
+    if it must stay above p_free because an object in it may be thinner than a pixel.
 
     Attributes:
         p_free: Probability of occupancy far before a measurement.
@@ -71,11 +71,11 @@ class SensorTable:
     """A tabulated sensor model.
 
     log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0. The
-    first column is looked up for everything farther before a measurement, and is p_free; the last for everything
+    first column holds for everything farther in front of a measurement, and is p_free; the last for everything
     farther behind, and is 0.
     hit: (ROWS,) log-odds of the cell that holds the measured point.
-    passed: (ROWS,) least log-odds, at most 0, of a cell at the row's depth that is looked through.
-    sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
+    passed: (ROWS,) least log-odds, at most 0, of a cell at the row's depth that rays pass through.
+    sigma: (ROWS,) noise in metres; row r is for measured depths around `(r + 0.5) / rows_per_metre`.
     """
 
     log_odds: Array
@@ -94,13 +94,14 @@ def tabulate(
 ) -> SensorTable:
     """Tabulate `model` for measured depths up to `max_range` metres and cells of `voxel_size` metres.
 
-    Evidence is log(p / (1 - p)) minus that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice). Sigma
-    is capped at `max_range`, so that no ray is followed farther than 1 + REACH_SIGMA times that. With noisy poses, the
-    width of a hit combines pose and range noise.
-    Raises ConfigError when the model leaves (0, 1), or does not reach p_free and p_unknown far off.
+    Evidence is log(p / (1 - p)) minus the same of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
+    Sigma is capped at `max_range`, so that no ray is followed farther than 1 + REACH_SIGMA times that. With noisy
+    poses,
+    the width of a hit combines pose and range noise.
+    Raises ConfigError if the model leaves (0, 1), or does not reach p_free and p_unknown far off.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
-    sigma = np.clip(noise.sigma(z_measured), 1e-6, max_range)  # a noisier one could be anywhere as well
+    sigma = np.clip(noise.sigma(z_measured), 1e-6, max_range)  # a noisier point could be anywhere
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
@@ -126,7 +127,9 @@ def _check_ends(model: InverseSensorModel, z_measured: Array, sigma: Array) -> N
         worst = p[np.argmax(np.abs(p - wanted))]
         if not abs(worst - wanted) <= END_TOLERANCE:
             where = f"{FAR_SIGMA:g} sigma {'before' if side < 0 else 'behind'} a measurement"
-            raise ConfigError(f"sensor model {type(model).__name__}: says {worst:.3g} {where}, must be {name} {wanted}")
+            raise ConfigError(
+                f"sensor model {type(model).__name__}: gives {worst:.3g} {where}, must be {name} {wanted}"
+            )
 
 
 def _log_odds(model: InverseSensorModel, p: Array) -> Array:

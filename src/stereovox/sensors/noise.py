@@ -15,14 +15,14 @@ from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import NoiseConfig
 
 SUBPIXEL = 0.08
-"""Default disparity noise in pixels: that of a RealSense D435 (Chien 2020, 2.2.4)."""
+"""Default disparity noise in pixels: a RealSense D435 (Chien 2020, 2.2.4)."""
 
 
 def kept_by_means(correlation_px: float) -> float:
     """Return by how much correlation along an axis raises the variance of means of many pixels; 1: independent.
 
-    The noise is white noise smoothed by a Gaussian of this standard deviation; this is the sum of its correlation over
-    all lags, (sum k)^2 / sum k^2 of the kernel k, about 3.54 times a standard deviation that is not small.
+    The noise is white noise smoothed by a Gaussian of this standard deviation. The factor sums its correlation over
+    all lags, (sum k)^2 / sum k^2 of the kernel k: about 3.54 standard deviations unless these are small.
     """
     if correlation_px <= 0:
         return 1.0
@@ -32,7 +32,7 @@ def kept_by_means(correlation_px: float) -> float:
 
 
 def looks(side: int, correlation_px: float) -> float:
-    """Return how many independent measurements a square of side x side pixels holds: its mean is as noisy as theirs."""
+    """Return how many independent measurements are as accurate on average as a square of side x side pixels."""
     if correlation_px <= 0:
         return float(side * side)
     lags = np.arange(1, side)
@@ -55,13 +55,13 @@ class RangeNoise:
 
     @classmethod
     def of(cls, config: NoiseConfig, camera: VirtualCamera | Lidar) -> RangeNoise:
-        """Return that of a lidar, whatever is configured; of a camera the configured noise, and where s2 is not set,
-        that of its stereo geometry.
+        """Return the noise of a lidar as it is, and of a camera as configured, or from its stereo geometry if s2 is not
+        set.
 
         s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square missing in print (Alg 3 has it), which
         is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
         in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
-        the noise grows (`stereovox.depth.stereo.reproject`), which the thesis leaves out as well.
+        the noise grows (`stereovox.depth.stereo.reproject`), which the thesis also leaves out.
         """
         if isinstance(camera, Lidar):
             return cls(camera.sigma, 0.0, 0.0)

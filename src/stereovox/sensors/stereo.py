@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default model: a hit counts by the probability that it lies in its cell; clearing counts less than hits."""
+"""The default model: a hit counts by the probability that it is in its cell; clearing counts less than hits."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from stereovox.sensors.model import END_SIGMA, Array
 class Stereo:
     """A model of stereo's range noise and of the size of cells.
 
-    Within `fade` sigma of the range noise before the measured point there is no evidence; from there towards the camera
-    the evidence for free space grows as a Gaussian falls, and is `p_free` from `END_SIGMA` on: a surface measured too
-    far does not clear itself, nor does a pole that the camera cannot separate from the wall behind it. Behind the point
-    there is no evidence either, so walls do not grow thick (the weakness of Valenti 2018, section 8.4).
+    There is no evidence within `fade` sigma of the range noise in front of the measured point; from there towards the
+    camera, the evidence for free space grows as a Gaussian falls, and it is `p_free` from `END_SIGMA` on. So a surface
+    measured too far does not clear itself, nor does a pole that the camera cannot separate from the wall behind it.
+    Behind the point there is no evidence either, so walls do not grow thick (the weakness of Valenti 2018, section
+    8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
-    its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which
-    the share `trust` is taken, since the errors of one frame recur in the next.
+    its noise leaves it in this cell, but at least with `p_least`. This becomes evidence relative to `prior`, and only
+    the share `trust` of it counts, since the errors of one frame recur in the next.
 
-    A cell that is looked through loses at most the share `passes` of what a hit at its depth would give: most frames
+    A cell that a ray passes through loses at most the share `passes` of what a hit at its depth would give: most frames
     see only what is behind a pole thinner than a pixel, and must not outvote the frames that do see it.
     """
 
@@ -43,7 +44,7 @@ class Stereo:
             raise ConfigError(f"sensor.fade {self.fade:g}: must be less than {END_SIGMA:.2f}, where the table ends")
 
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
-        """Return p_free up to `END_SIGMA` before the measurement, rising to p_unknown at `fade` sigma before it."""
+        """Return p_free up to `END_SIGMA` in front of the measurement, rising to p_unknown at `fade` sigma from it."""
         t = np.minimum((np.asarray(z) - z_measured) / sigma + self.fade, 0.0)
         end = exp(-0.5 * (END_SIGMA - self.fade) ** 2)
         rise = (np.exp(-0.5 * t * t) - end) / (1 - end)
@@ -57,7 +58,7 @@ class Stereo:
         return np.maximum(1 / (1 + np.exp(-evidence)), self.p_least)
 
     def passed(self, z: Array, sigma: Array, voxel_size: float) -> Array:
-        """Return the least probability of a cell at depth `z` that is looked through, at even prior odds."""
+        """Return the lowest probability of a cell at depth `z` that a ray passes through, at even prior odds."""
         hit = self.hit(z, sigma, voxel_size)
         return 1 / (1 + (hit / (1 - hit)) ** self.passes)
 

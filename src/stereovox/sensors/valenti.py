@@ -40,6 +40,6 @@ class Valenti:
         offset = np.asarray(z) - z_measured
         a = self.peak(sigma)
         before = self.p_free + (a + self.p_unknown - self.p_free) * np.exp(-0.5 * (offset / sigma) ** 2)
-        with np.errstate(divide="ignore", invalid="ignore"):  # of a very large sigma no tail is left
+        with np.errstate(divide="ignore", invalid="ignore"):  # a very large sigma leaves no tail
             behind = self.p_unknown + a * np.exp(-0.5 * (offset / self.tail(sigma)) ** 2)
         return np.where(offset <= 0, before, behind)

@@ -69,7 +69,7 @@ def read_points(path: str | Path) -> Points:
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
     except (ValueError, ConfigError) as error:
-        raise MapFileError(f"{path}: no points that can be read: {error}") from None
+        raise MapFileError(f"{path}: no readable points: {error}") from None
 
 
 class _Head(NamedTuple):

@@ -207,7 +207,7 @@ def test_grids_of_different_bounds_are_stitched_where_they_belong():
 def test_unequal_steps_are_refused():
     with pytest.raises(ConfigError, match="these have 5 and 10 deg"):
         stitch([empty(SphereLayout.of(10)), empty(SphereLayout.of(5))])
-    with pytest.raises(ConfigError, match="step_deg must go into 180"):
+    with pytest.raises(ConfigError, match="step_deg must divide 180"):
         SphereLayout.of(7)
     with pytest.raises(ConfigError, match="polar_deg"):
         SphereLayout.of(10, (90, 20))

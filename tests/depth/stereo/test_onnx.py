@@ -71,7 +71,7 @@ def test_what_is_no_network_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         matcher(tmp_path / "none.onnx")
     turned = network(tmp_path / "turned.onnx", tail=(0, 1, 3, 2))
-    with pytest.raises(ConfigError, match="of their size is needed"):
+    with pytest.raises(ConfigError, match="give a disparity of their size"):
         matcher(turned)(*images())
     with pytest.raises(ConfigError, match="takes two images"):
         matcher(network(tmp_path / "flat.onnx", ("c", "h", "w"), (0, 1, 2)))

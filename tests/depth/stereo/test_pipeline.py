@@ -147,7 +147,7 @@ def test_the_vehicle_is_masked(aligned, eye):
     wanted[40:70, 100 - shift : 150 - shift] = True
     assert np.mean((found.reason == Reason.MASKED) != wanted) < 0.005
     assert np.isnan(found.disparity[found.reason == Reason.MASKED]).all()
-    with pytest.raises(StereovoxError, match=r"mask is \(3, 4\), its camera says \(120, 240\)"):
+    with pytest.raises(StereovoxError, match=r"mask is \(3, 4\), its camera has \(120, 240\)"):
         StereoDepth(stereo()).disparity(plane(12.0, **{eye: np.ones((3, 4), bool)}))
 
 

@@ -220,7 +220,7 @@ def test_a_library_that_is_missing_is_named_with_the_cure(monkeypatch, name, pac
 
 def test_no_usable_frame_is_one_line():
     blind = replace(a_frame(), depth=np.zeros((48, 64), np.uint16))
-    with pytest.raises(StereovoxError, match=r"not one frame can be used \(frame 0: not one pixel"):
+    with pytest.raises(StereovoxError, match=r"not one frame can be used \(frame 0: no pixel"):
         bench([blind, blind], [0.1], [])
     with pytest.raises(StereovoxError, match="the source is empty"):
         bench([], [0.1], [])

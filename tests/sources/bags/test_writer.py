@@ -353,7 +353,7 @@ def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("nowhere/walk.bag", "No such file or directory.*choose a folder that exists"),
+        ("nowhere/walk.bag", "No such file or directory.*choose an existing folder"),
         ("nowhere/walk", "No such file or directory"),
         ("folder.bag", "is a folder; name a file"),
         ("a#b.db3", "takes \\?, # and % in a name amiss"),

@@ -142,5 +142,5 @@ def test_a_bad_file_is_one_line_with_its_name(tmp_path, change, said):
 def test_a_cut_off_file(tmp_path):
     path = nerf(tmp_path) / "transforms.json"
     path.write_text(path.read_text()[:-20])
-    with pytest.raises(SourceError, match="no JSON that can be read"):
+    with pytest.raises(SourceError, match="not valid JSON"):
         open_source(tmp_path)

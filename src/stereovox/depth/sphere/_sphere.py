@@ -18,7 +18,7 @@ def gather_image(depth_m, reason, columns, rows, pose, near, far, layout, cells,
     """Put the pixels of a REP 117 depth image (height, width) into the cells of a grid.
 
     columns, rows: `camera.rays()`; pose: (3, 4) float32, maps the optical frame into the grid's. A pixel that is
-    TOO_FAR counts as a point at depth `far`, up to which its ray is free, one that is TOO_NEAR as one at `near`.
+    TOO_FAR counts as a point at depth `far`, up to which its ray is free; one that is TOO_NEAR as a point at `near`.
     scratch: (2, width) float32.
     """
     width = depth_m.shape[1]
@@ -45,7 +45,7 @@ def gather_image(depth_m, reason, columns, rows, pose, near, far, layout, cells,
 
 @kernel
 def gather_points(points, reason, layout, cells):
-    """Put points (N, 3) float32 of the grid's frame into its cells; `reason` (N,) as of pixels."""
+    """Put points (N, 3) float32 of the grid's frame into its cells; `reason` (N,) is as for pixels."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         place = _place(x, y, z, layout)
@@ -56,7 +56,7 @@ def gather_points(points, reason, layout, cells):
 
 @cell
 def _place(x, y, z, layout):
-    """Return the number of the cell in which a direction falls, -1 outside of the grid (Valenti 2018, Eq 5.2)."""
+    """Return the number of the cell that contains a direction, -1 outside the grid (Valenti 2018, Eq 5.2)."""
     polar = _arctan2(np.sqrt(x * x + y * y), z)
     azimuth = _arctan2(y, x)
     j = np.int32(min(polar * layout.per_radian, np.float32(layout.half_turn - 1))) - layout.first_polar
@@ -81,7 +81,7 @@ def _arctan2(y, x):
 
 @cell
 def _add(place, rho, why, cells):
-    """Take one point into the statistics of its cell; mean and squares by Welford, which float32 can bear."""
+    """Add one point to the statistics of its cell; Welford's mean and squares are accurate enough in float32."""
     if why == VALID:
         n = cells.number[place] + np.int32(1)
         away = rho - cells.mean[place]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The spherical grid: how far the nearest surface is in each direction from the vehicle (Valenti 2018, 5.3)."""
+"""The spherical grid: the distance to the nearest surface in each direction from the vehicle (Valenti 2018, 5.3)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from stereovox.geometry.se3 import Transform, transform_points
 from stereovox.sensors.noise import SUBPIXEL
 
 PIXEL = 1.5
-"""Size that a pixel counts as: its diagonal, and a margin since the grid's origin may be nearer than the eye."""
+"""Assumed pixel size: its diagonal, with a margin since the grid's origin may be nearer than the eye."""
 NEVER = np.iinfo(np.int64).min
 """Stamp of a cell that was never seen."""
 RANK = np.array([1, 3, 0, 2, 3, 3], np.uint8)
-"""Rank of each `Reason` where two meet, lowest first: too near, surface, free up to a range, unknown."""
+"""Priority of each `Reason` if two meet, lowest first: too near, surface, free up to a range, unknown."""
 ARRAYS = ("range_m", "reason", "count", "stamp_ns")
 
 
@@ -41,13 +41,13 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SphereGrid:
-    """One range for each direction from the origin of the body, and how old it is. Arrays are (azimuths, polars).
+    """One range for each direction from the origin of the body, and its age. Arrays are (azimuths, polars).
 
-    layout: the directions. range_m: float32 metres to the nearest surface where `reason` is VALID; up to which the
-        direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nothing was seen.
-    reason: uint8 of `Reason`, UNKNOWN where nothing was seen. count: int32 points of a cell.
+    layout: the directions. range_m: float32 metres to the nearest surface if `reason` is VALID; end of the free
+        part if TOO_FAR; 0 if TOO_NEAR; NaN if nothing was seen.
+    reason: uint8 of `Reason`, UNKNOWN if nothing was seen. count: int32 points of a cell.
     stamp_ns: int64 time of a cell's range, NEVER if it has none.
-    camera: of all that took part the one whose ranges are the noisiest; None if none is known.
+    camera: the contributing camera with the noisiest ranges; None if unknown.
     """
 
     layout: SphereLayout
@@ -74,7 +74,7 @@ class SphereGrid:
 
 
 def empty(layout: SphereLayout) -> SphereGrid:
-    """Return a grid in which nothing is known."""
+    """Return a grid in which every cell is unknown."""
     shape = layout.shape
     return SphereGrid(
         layout,
@@ -91,9 +91,9 @@ def accumulate(
     """Return the grid of one depth image (Valenti 2018, Eq 5.2 to 5.4).
 
     T_body_sensor: (4, 4) maps the image's optical frame into the body's (x forward, y left, z up), the grid's origin.
-    layout: the directions; without it those of `config.sphere`. A cell is TOO_NEAR where any of its pixels is, else
-    VALID where any pixel has a depth, else TOO_FAR where any pixel is. Near the poles, where cells are narrower than
-    pixels, what lies between two pixels takes the nearest next to it.
+    layout: the directions; default: `config.sphere`. A cell is TOO_NEAR if any of its pixels is, else
+    VALID if any pixel has a depth, else TOO_FAR if any pixel is. Near the poles, where cells are narrower than
+    pixels, gaps between pixels take the nearest adjacent value.
     """
     layout = layout or SphereLayout.configured(config.sphere)
     cells, camera = _new_cells(layout), image.camera
@@ -109,7 +109,7 @@ def accumulate(
 
 
 def gather(points: ArrayLike, stamp_ns: int, config: SphereConfig, layout: SphereLayout | None = None) -> SphereGrid:
-    """Return the grid of points (N, 3) in metres, frame of the body, seen at one time; NaN points count nowhere."""
+    """Return the grid of points (N, 3) in metres, frame of the body, seen at one time; NaN points are ignored."""
     layout = layout or SphereLayout.configured(config)
     finite = np.asarray(points, np.float32).reshape(-1, 3)
     finite = np.ascontiguousarray(finite[np.isfinite(finite).all(axis=1)])
@@ -147,7 +147,7 @@ def _nearest(cells: Cells, config: SphereConfig) -> NDArray[np.float32]:
 
 
 def _fill_between_pixels(grid: SphereGrid, pixel: float) -> None:
-    """Close the holes near the poles, in place: a pixel is so many radians wide and covers several cells there."""
+    """Close the holes near the poles, in place: a pixel `pixel` radians wide covers several cells there."""
     width = np.sin(grid.layout.polar()) * grid.layout.step
     known = grid.known
     for j in np.flatnonzero((width < pixel) & known.any(axis=0) & ~known.all(axis=0)).tolist():
@@ -159,7 +159,7 @@ def _fill_between_pixels(grid: SphereGrid, pixel: float) -> None:
 
 
 def _winner_beside(grid: SphereGrid, j: int, reach: int) -> NDArray[np.int64]:
-    """Return the azimuth cell (azimuths,) that wins among those at most `reach` aside in one ring, -1: none known."""
+    """Return the azimuth cell (azimuths,) that wins among those up to `reach` away in one ring, -1: none known."""
     n, turn = grid.layout.azimuths, 2 * grid.layout.per_half_turn
     rank = RANK[grid.reason[:, j]] * 1e6 + np.nan_to_num(grid.range_m[:, j].astype(float))
     rank[~grid.known[:, j]] = np.inf
@@ -171,9 +171,9 @@ def _winner_beside(grid: SphereGrid, j: int, reach: int) -> NDArray[np.int64]:
 
 
 def stitch(grids: Sequence[SphereGrid]) -> SphereGrid:
-    """Return one grid of several: in each direction the nearest wins and keeps its age (Valenti 2018, 5.4).
+    """Return one grid from several: in each direction the nearest wins and keeps its age (Valenti 2018, 5.4).
 
-    A surface wins against what is only known to be free up to somewhere; at equal ranges the newest wins. Bounds may
+    A surface wins against directions only known to be free up to a range; at equal ranges the newest wins. Bounds may
     differ. Raises ConfigError if steps differ.
     """
     layout = union([grid.layout for grid in grids])
@@ -183,14 +183,14 @@ def stitch(grids: Sequence[SphereGrid]) -> SphereGrid:
 def moved(grid: SphereGrid, T_new_old: Transform) -> SphereGrid:
     """Return the grid as the body sees it after it has moved; T_new_old (4, 4) maps its old frame into the new one.
 
-    Each range is taken to where it stands now and keeps its age; what fell between two cells is unknown. For moves that
-    are small against the ranges: what the vehicle could not see round from its old place is not known either.
+    Each range moves to its new direction and keeps its age; gaps between two cells are unknown. For moves that
+    are small compared with the ranges: what was hidden from the old position stays unknown.
     """
     seen = grid.known & (grid.reason != Reason.TOO_NEAR)
     points = transform_points(T_new_old, grid.layout.directions()[seen] * grid.range_m[seen, None])
     ranges = np.linalg.norm(points, axis=1)
     values = {"range_m": ranges, **{name: getattr(grid, name)[seen] for name in ARRAYS[1:]}}
-    order = np.lexsort((-ranges, -RANK[values["reason"]].astype(int)))  # what wins is written last
+    order = np.lexsort((-ranges, -RANK[values["reason"]].astype(int)))  # the winner is written last
     place = grid.layout.cells_of(points)
     order = order[place[order] >= 0]
     into = empty(grid.layout)
@@ -200,7 +200,7 @@ def moved(grid: SphereGrid, T_new_old: Transform) -> SphereGrid:
 
 
 def _widened(grid: SphereGrid, layout: SphereLayout) -> SphereGrid:
-    """Return the grid with other bounds, which hold its own."""
+    """Return the grid with wider bounds, which contain its own."""
     if grid.layout == layout:
         return grid
     into = empty(layout)

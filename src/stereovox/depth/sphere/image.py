@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spherical grid as a depth image, which is what the mapper takes."""
+"""A spherical grid as a depth image, the mapper's input."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from stereovox.geometry.se3 import Transform, inverse
 T_BODY_GRID: Transform = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 """From the optical frame of a grid's image to the body: its x axis, the pole of all rows, points down."""
 T_BODY_OPTICAL: Transform = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From the optical frame of a camera that looks ahead (x right, y down, z forward) to the body's."""
+"""From the optical frame of a camera that points ahead (x right, y down, z forward) to the body's."""
 T_OPTICAL_GRID: Transform = inverse(T_BODY_OPTICAL) @ T_BODY_GRID
 MAX_BINNING, MAX_BASELINE_M = 1_000_000, 1e6
-"""What a grid's camera counts up to: that of an eye with the narrowest of pixels is beyond what a camera can be."""
+"""Limits of a grid camera's numbers: an eye with the narrowest pixels would exceed the limits of a camera."""
 
 
 def frame_of(grid: SphereGrid, T_world_body: Transform, max_range: float, name: str = "sphere") -> Frame:
     """Return the grid as a frame of a spherical camera at the body's origin, to be mapped like any other.
 
-    Rows of the image are azimuths, columns polar angles; one pixel looks through the middle of each cell. Depth is the
+    Rows of the image are azimuths, columns polar angles; the ray of each pixel is the centre of a cell. Depth is the
     distance from the body's z axis, float32 metres. Cells within two degrees of that axis are left out, since they
-    have no such depth; and a cell that is free up to less than `max_range` from the axis is UNKNOWN, since a frame
-    can only say that all up to `max_range` (metres) is free.
+    have no such depth. A cell that is free up to less than `max_range` from the axis is UNKNOWN, since a frame
+    can only mark rays as free up to `max_range` (metres).
     stamp_ns is the newest of the grid. Noise is that of the grid's `camera`.
     """
     columns, camera = _image_of(grid.layout, grid.camera)
@@ -43,11 +43,11 @@ def frame_of(grid: SphereGrid, T_world_body: Transform, max_range: float, name: 
 
 
 def through_sphere(image: DepthImage, config: Config) -> DepthImage:
-    """Return the depth image of the spherical grid that the pixels of `image` make; without a step `image` itself.
+    """Return the depth image of the spherical grid that the pixels of `image` form; without a step, `image` itself.
 
-    The grid's origin is the camera's eye, its pole the camera's y axis, its step `sphere.step_deg`; it reaches as far
-    as the image, whatever bounds the settings name, so no pixel but those within two degrees of the pole is lost.
-    Raises FrameRefused `bad_camera` if it sees nothing else.
+    The grid's origin is the camera's eye, its pole the camera's y axis, its step `sphere.step_deg`; it covers the
+    whole image, whatever bounds the settings name, so only pixels within two degrees of the pole are lost.
+    Raises FrameRefused `bad_camera` if nothing else is in view.
     """
     if config.sphere.step_deg is None:
         return image
@@ -63,13 +63,13 @@ def through_sphere(image: DepthImage, config: Config) -> DepthImage:
 
 @lru_cache(maxsize=16)
 def _layout_of(camera: VirtualCamera, step_deg: float) -> SphereLayout:
-    """Return the cells that the camera looks into."""
+    """Return the cells in the camera's view."""
     columns, rows = (rays.astype(float) for rays in camera.rays())
     x, y, z = np.broadcast_arrays(columns[None, :], rows[:, :1], rows[:, 1:])
     polar, azimuth = np.degrees(np.arctan2(np.hypot(z, x), -y)), np.degrees(np.arctan2(-x, z))
     low, high = max(polar.min() - 1e-3, 0.0), min(polar.max() + 1e-3, 180.0)
     left, right = azimuth.min() - 1e-3, azimuth.max() + 1e-3
-    behind = left < -180 or right > 180 or (np.abs(azimuth) > 90).any()  # rows that look back wrap round the pole
+    behind = left < -180 or right > 180 or (np.abs(azimuth) > 90).any()  # rows that point backwards wrap round the pole
     return SphereLayout.of(step_deg, (low, high), (-180.0, 180.0) if behind else (left, right))
 
 
@@ -79,7 +79,7 @@ def _image_of(layout: SphereLayout, eye: VirtualCamera | None) -> tuple[slice, S
     elevation = np.degrees(layout.polar()) - 90
     inside = np.flatnonzero(np.abs(elevation) <= WIDEST_DEG)
     if not len(inside):
-        blind = f"the camera sees only what is within {90 - WIDEST_DEG:g} degrees of the axis of the spherical grid"
+        blind = f"the camera sees only directions within {90 - WIDEST_DEG:g} degrees of the axis of the spherical grid"
         raise FrameRefused("bad_camera", f"{blind}; leave sphere.step_deg out")
     first, last = int(inside[0]), int(inside[-1]) + 1
     step = layout.step
@@ -88,7 +88,7 @@ def _image_of(layout: SphereLayout, eye: VirtualCamera | None) -> tuple[slice, S
     binning, baseline = 1, None
     if eye is not None:
         binning = min(max(1, round(eye.focal_px * step)), MAX_BINNING)
-        kept = eye.focal_px * step / binning  # focal length times baseline is
+        kept = eye.focal_px * step / binning  # keeps focal length times baseline
         baseline = eye.baseline and min(eye.baseline * kept, MAX_BASELINE_M)
     camera = SphericalCamera(
         last - first, layout.azimuths, step, step, cu, cv, baseline, binning, subpixel=eye.subpixel if eye else None
@@ -109,6 +109,6 @@ def _depth(
 
 
 def _special(depth: NDArray[np.float32], reason: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return depth with REP 117's values if there is none."""
+    """Return depth with REP 117's special values for invalid pixels."""
     none = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)[reason]
     return np.where(reason == Reason.VALID, depth, none)

@@ -15,7 +15,7 @@ from stereovox.config import SphereConfig, load_config
 from stereovox.errors import ConfigError
 
 ROUNDING = 1e-6
-"""Cells by which a bound may exceed a cell without adding another."""
+"""Share of a cell by which a bound may exceed a cell without adding another."""
 
 
 class KernelLayout(NamedTuple):
@@ -53,19 +53,19 @@ class SphereLayout:
         polar_deg: tuple[float, float] = (0.0, 180.0),
         azimuth_deg: tuple[float, float] = (-180.0, 180.0),
     ) -> SphereLayout:
-        """Return the smallest layout of whole cells that holds these angles.
+        """Return the smallest layout of whole cells that contains these angles.
 
-        Raises ConfigError, one line, as for the settings of these names.
+        Raises ConfigError, one line, as for the settings of the same names.
         """
         given = {"step_deg": step_deg, "polar_deg": polar_deg, "azimuth_deg": azimuth_deg}
         return cls.configured(load_config(sphere=given).sphere)
 
     @classmethod
     def configured(cls, config: SphereConfig) -> SphereLayout:
-        """Return the layout that the settings name. Raises ConfigError if they name no step."""
+        """Return the layout of the settings. Raises ConfigError if they have no step."""
         if config.step_deg is None:
             raise ConfigError(
-                "sphere.step_deg is not set: there is no spherical grid; set it to degrees, for example 2"
+                "sphere.step_deg is not set, so there is no spherical grid; set it to degrees, for example 2"
             )
         n = round(180 / config.step_deg)
         step = 180 / n
@@ -93,7 +93,7 @@ class SphereLayout:
         return (self.first_polar + np.arange(self.polars, dtype=float) + 0.5) * self.step
 
     def azimuth(self) -> NDArray[np.float64]:
-        """Return the azimuth (azimuths,) of the cells' centres in radians; it rises, from -pi to 3 pi at most."""
+        """Return the azimuth (azimuths,) of the cells' centres in radians; ascending, from -pi to 3 pi at most."""
         return (self.first_azimuth + np.arange(self.azimuths, dtype=float) + 0.5) * self.step - math.pi
 
     def directions(self) -> NDArray[np.float64]:
@@ -113,7 +113,8 @@ class SphereLayout:
         return np.where(inside, i * self.polars + j, -1)
 
     def places_in(self, other: SphereLayout) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return where this layout's azimuth (azimuths,) and polar cells (polars,) stand in one that holds them."""
+        """Return the indices of this layout's azimuth (azimuths,) and polar cells (polars,) in one that contains
+        them."""
         i = (self.first_azimuth - other.first_azimuth + np.arange(self.azimuths)) % (2 * self.per_half_turn)
         return i, self.first_polar - other.first_polar + np.arange(self.polars)
 
@@ -125,11 +126,11 @@ class SphereLayout:
 
 
 def union(layouts: Sequence[SphereLayout]) -> SphereLayout:
-    """Return a layout that holds all of these. Raises ConfigError if their steps differ."""
+    """Return a layout that contains all of these. Raises ConfigError if their steps differ."""
     steps = sorted({layout.per_half_turn for layout in layouts})
     if len(steps) != 1:
         found = " and ".join(f"{180 / n:g}" for n in reversed(steps)) or "none"
-        raise ConfigError(f"sphere: grids can be stitched when their steps are equal, these have {found} deg")
+        raise ConfigError(f"sphere: only grids of equal steps can be stitched, these have {found} deg")
     low = min(layout.first_polar for layout in layouts)
     high = max(layout.first_polar + layout.polars for layout in layouts)
     first, azimuths = _arc([(layout.first_azimuth, layout.azimuths) for layout in layouts], 2 * steps[0])
@@ -137,7 +138,7 @@ def union(layouts: Sequence[SphereLayout]) -> SphereLayout:
 
 
 def _arc(arcs: list[tuple[int, int]], turn: int) -> tuple[int, int]:
-    """Return first cell and length of the shortest arc round the pole that holds all of these."""
+    """Return first cell and length of the shortest arc round the pole that contains all of these."""
     best = (0, turn)
     for first, _ in sorted(arcs):
         length = max((start - first) % turn + count for start, count in arcs)

@@ -47,11 +47,11 @@ class Sight:
 
 
 def range_in(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0, unseen: float = 0.0) -> Sight | None:
-    """Return how far one may fly towards `direction`, None if that is not known.
+    """Return the free distance towards `direction`, None if unknown.
 
     direction: (3,) in the frame of the body, of any length. half_angle_deg: of a cone round it, all of which must be
     free; each cell that the cone touches counts. unseen: largest share of the cone that may be unknown; more than 0
-    means that something may stand there.
+    accepts that an obstacle may be there.
     Raises StereovoxError for a direction without length and for angles outside [0, 180].
     """
     sight = sight_of(grid, direction, half_angle_deg)
@@ -61,7 +61,7 @@ def range_in(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0
 def sight_of(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0) -> Sight | None:
     """Return the nearest range in a cone, even if only part of the cone was seen; None if nothing was.
 
-    What was not seen may be nearer: see `Sight.seen`. Arguments and errors as for `range_in`.
+    Unseen parts may hold nearer obstacles: see `Sight.seen`. Arguments and errors as for `range_in`.
     """
     return _nearest(grid, *_cone(grid, direction, half_angle_deg))
 
@@ -88,9 +88,9 @@ def _nearest(grid: SphereGrid, touched: NDArray[np.bool_], missing: float) -> Si
 
 
 def _cone(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float) -> tuple[NDArray[np.bool_], float]:
-    """Return the cells (azimuths, polars) that a cone touches, and how much of it lies outside of the grid.
+    """Return the cells (azimuths, polars) that a cone touches, and how much of it is outside the grid.
 
-    The last as the sum of sin(polar angle) over cells, as solid angles are compared here.
+    The latter is a sum of sin(polar angle) over cells, the measure of solid angle used here.
     """
     axis = np.asarray(direction, float).reshape(-1)
     length = float(np.linalg.norm(axis)) if axis.shape == (3,) and np.isfinite(axis).all() else 0.0
@@ -101,7 +101,7 @@ def _cone(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float) -> tupl
     layout, whole = grid.layout, grid.layout.whole()
     near = np.zeros(whole.shape, bool)
     if half_angle_deg > 0:
-        reach = math.radians(half_angle_deg) + whole.step / math.sqrt(2)  # from a cell's middle to its corners
+        reach = math.radians(half_angle_deg) + whole.step / math.sqrt(2)  # from a cell's centre to its corners
         near = _chords(whole, axis / length) <= 2 * math.sin(min(reach, math.pi) / 2)
     near.flat[whole.cells_of(axis)] = True
     touched = near[np.ix_(*layout.places_in(whole))]
@@ -109,7 +109,7 @@ def _cone(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float) -> tupl
 
 
 def _chords(layout: SphereLayout, axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far each cell's unit vector is from `axis`."""
+    """Return the distance of each cell's unit vector from `axis`."""
     return np.linalg.norm(_directions(layout) - axis, axis=-1)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The combined view of a vehicle's cameras: the last grid of each, moved to the vehicle's present pose."""
+"""The combined view of a vehicle's cameras: the last grid of each, moved to the vehicle's current pose."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from stereovox.geometry.se3 import Transform, inverse, orthonormalise
 def vehicle_grid(
     frames: Iterable[AnyFrame], config: Config, tell: Callable[[str], object] = lambda line: None
 ) -> tuple[SphereGrid, int, dict[str, int]]:
-    """Return the grid of all pairs' last frames, the time of the newest in ns, and how many were refused and why.
+    """Return the grid of all pairs' last frames, the time of the newest in ns, and the number of refused frames by
+    reason.
 
-    A pair is known by its name; its last frame without a `fault` counts, and only that one is matched. `tell` is given
-    one line for each pair whose newest frame cannot be used. A depth camera has no name and counts as one that stands
-    at the body's origin and looks ahead. So does a pair whose T_body_left is the identity: poses are then those of its
+    Pairs are identified by name. The last frame without a `fault` counts, and only that one is matched. `tell` receives
+    one line for each pair whose newest frame cannot be used. A depth camera has no name and is assumed to be
+    at the body's origin and to point ahead. So is a pair whose T_body_left is the identity: poses are then those of its
     optical frame, and the body has its axes turned to x forward, y left, z up, for all pairs.
-    Raises StereovoxError if no frame at all could be used.
+    Raises StereovoxError if no frame could be used.
     """
     newest, why, refused = _newest(frames)
     path, T_ahead_body = DepthPipeline(config), _axes(newest.values())
@@ -37,7 +38,7 @@ def vehicle_grid(
             refused[error.reason] = refused.get(error.reason, 0) + 1
             why[name] = str(error)
     if not last:
-        raise StereovoxError(f"not one frame could be used ({next(iter(why.values()), 'the source is empty')})")
+        raise StereovoxError(f"no frame could be used ({next(iter(why.values()), 'the source is empty')})")
     for name, text in why.items():
         tell(f"{name or 'the camera'}: its last frame cannot be used ({text})")
     grid, now_ns = together(last)
@@ -47,7 +48,8 @@ def vehicle_grid(
 def _newest(
     frames: Iterable[AnyFrame],
 ) -> tuple[dict[str, AnyFrame], dict[str, str], dict[str, int]]:
-    """Return each pair's last frame without a fault, why there is a later one with a fault, and how many have which."""
+    """Return each pair's last frame without a fault, the fault of a later frame if any, and the number of each
+    fault."""
     newest: dict[str, AnyFrame] = {}
     why: dict[str, str] = {}
     refused: dict[str, int] = {}
@@ -63,7 +65,7 @@ def _newest(
 
 
 def _axes(frames: Iterable[AnyFrame]) -> Transform:
-    """Return T_ahead_body: what turns the axes of the poses' frame to x forward, y left, z up."""
+    """Return T_ahead_body, which turns the axes of the poses' frame to x forward, y left, z up."""
     optical = any(isinstance(frame, StereoFrame) and _is_body(frame.pair) for frame in frames)
     return T_BODY_OPTICAL if optical else np.eye(4)
 
@@ -79,21 +81,21 @@ def _is_body(pair: StereoPair) -> bool:
 def _grid_of(
     frame: AnyFrame, T_ahead_body: Transform, path: DepthPipeline, config: Config
 ) -> tuple[SphereGrid, Transform]:
-    """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
+    """Return the grid of one frame in the frame of the forward-facing body, and T_world_ahead."""
     mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
     image = path.checked(path.matched(frame))
     T_world_body = orthonormalise(np.asarray(frame.T_world_sensor, float)) @ inverse(mounted)
-    T_body_eye = inverse(T_world_body) @ image.T_world_sensor  # the right eye's, where that is the one with depth
+    T_body_eye = inverse(T_world_body) @ image.T_world_sensor  # the right eye's if that one has the depth
     return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body
 
 
 def together(
     last: Mapping[str, tuple[SphereGrid, Transform]], now: tuple[int, Transform] | None = None
 ) -> tuple[SphereGrid, int]:
-    """Return the grid of all cameras' last ones, seen from where the body was at the newest, and its time in ns.
+    """Return the last grids of all cameras as one, seen from the body's pose at the newest, and its time in ns.
 
-    last: by camera, at least one: its grid, and T_world_body (4, 4) when it was taken. now: a later time in ns and
-    T_world_body then, from where it is seen in place of the newest.
+    last: by camera, at least one: its grid, and T_world_body (4, 4) at its time. now: a later time in ns and
+    T_world_body then, to be used instead of the newest.
     """
     newest, T_world_now = max(last.values(), key=lambda item: _stamp(item[0]))
     at_ns = _stamp(newest)

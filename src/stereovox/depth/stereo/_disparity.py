@@ -20,8 +20,8 @@ UNITS = np.float32(64)
 def pixels(raw, fractions, lag, out):
     """Fill `out` from `raw` (h, w) int16: counts of 1/16 px, negative: none.
 
-    fractions: (16,) float32, what the last four bits of a count stand for, in pixels. lag: rows by which the disparity
-    drags behind going down; taken back along the vertical slope, where that is less than one pixel a row.
+    fractions: (16,) float32, the value in pixels of the last four bits of a count. lag: rows by which disparities
+    are late on the way down; corrected along the vertical slope if it is less than one pixel a row.
     """
     height, width = raw.shape
     for v in range(height):
@@ -39,8 +39,8 @@ def pixels(raw, fractions, lag, out):
 def double(half, first, end, out):
     """Fill rows `first` to `end` of `out` with twice the disparity of halved images (h, w): linear where smooth.
 
-    out: (2 h, 2 w) float32, or less by a row or a column. Smooth is where the linear one differs by less than a pixel
-    from the nearest; elsewhere the nearest stays, and with it edges.
+    out: (2 h, 2 w) float32, or one row or column less. A pixel is smooth if linear and nearest interpolation differ by
+    less than a pixel; elsewhere the nearest value stays, which keeps edges.
     """
     height, width = half.shape
     for v in range(first, end):
@@ -63,7 +63,7 @@ def _between(near, far):
 
 @kernel
 def cross_check(disparity, side, most, seen):
-    """Drop pixels in place that share their partner in the other image with one nearer by more than `most` pixels.
+    """Drop pixels in place whose partner in the other image has a match nearer by more than `most` pixels.
 
     side: -1: the partner of u is u - disparity, 1: u + disparity. seen: (w,) float32 scratch.
     """
@@ -84,11 +84,12 @@ def cross_check(disparity, side, most, seen):
 
 @kernel
 def confidence(disparity, radius, tall, first, end, sums, out):
-    """Fill `out` with the mean of two windows' say in whether a disparity is right; no value: 0.
+    """Fill `out` with the mean of two windows' confidence that a disparity is right; no value: 0.
 
-    radius: the square window spans so many pixels to each side. tall: the upright one spans so many rows up and down,
-    and one column to each side. first, end: the rows that are filled. sums: (6, w + 2 radius + 1) int32, scratch: of
-    the columns of both windows and along the row the disparities and how many there are.
+    radius: the square window spans this many pixels to each side. tall: the upright one spans this many rows up and
+    down,
+    and one column to each side. first, end: the rows to fill. sums: (6, w + 2 radius + 1) int32, scratch: sums and
+    counts of disparities in the columns of both windows and along the row.
     """
     height = disparity.shape[0]
     sums[:] = NOUGHT
@@ -106,7 +107,7 @@ def confidence(disparity, radius, tall, first, end, sums, out):
 
 @cell
 def _enter(disparity, v, radius, first, columns, filled):
-    """Move the columns' sums on to row v; return how many rows they hold."""
+    """Advance the columns' sums to row v; return how many rows they contain."""
     height = disparity.shape[0]
     if v + radius < height:
         _put(disparity[v + radius], PLUS, columns, filled)
@@ -123,7 +124,7 @@ def _trust(row, rows, rows_tall, radius, sums, out):
     columns, filled, line, line_filled = sums[2], sums[3], sums[4], sums[5]
     for u in range(width):
         x, d = np.int32(u), row[u]
-        total = np.int32(line[u + reach] - line[u])  # sums may wrap round, differences not
+        total = np.int32(line[u + reach] - line[u])  # sums may wrap round; differences do not
         count = np.int32(line_filled[u + reach] - line_filled[u])
         square = _say(d, total, count, per_row / _columns(x, side, last))
         upright = _say(d, _of_three(columns, u), _of_three(filled, u), per_tall / _columns(x, PLUS, last))
@@ -137,7 +138,7 @@ def _of_three(columns, u):
 
 @cell
 def _say(d, total, count, per_pixel):
-    """Return the cube of the share of a window that has a disparity, less where d is off the window's mean."""
+    """Return the cube of the share of a window that has a disparity, reduced if d differs from the window's mean."""
     there = np.float32(count)
     off = abs(d - np.float32(total) / (UNITS * there)) / (ONE + SLOPE * d)
     share = there * per_pixel
@@ -149,7 +150,7 @@ def texture(image, down, across, first, end, columns, line, out):
     """Fill `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
 
     The window spans `down` rows and `across` columns to each side; at the image's sides there is no step, so 0 counts.
-    first, end: the rows that are filled. columns: (w + 2,) and line: (w + 2 across + 1,) int32, scratch.
+    first, end: the rows to fill. columns: (w + 2,) and line: (w + 2 across + 1,) int32, scratch.
     """
     height = image.shape[0]
     columns[:] = NOUGHT
@@ -175,18 +176,18 @@ def _mean(line, rows, across, out):
 
 @cell
 def _columns(u, side, last):
-    """Return how many columns a window has that spans `side` columns to each side of u, but none beyond the image."""
+    """Return the width of a window that spans `side` columns to each side of u, limited to the image."""
     return np.float32(np.int32(min(np.int32(u + side), last) - max(np.int32(u - side), NOUGHT)) + PLUS)
 
 
 @kernel
 def explain(disparity, sure, steps, valid, valid_other, side, settings, reason):
-    """Drop in place what has no place in the other image, is too near, too far or not sure; fill `reason`.
+    """Drop in place values outside the other image, too near, too far or uncertain; fill `reason`.
 
-    sure: (h, w) confidence, made 0 where nothing stays. steps: (h, w) float32, the texture. valid, valid_other: (h, w)
+    sure: (h, w) confidence, set to 0 for dropped values. steps: (h, w) float32, the texture. valid, valid_other: (h, w)
     bool of the aligned and of the other image, or (0, 0): all may be used. side: as in `cross_check`. settings: (9,)
     float32: most disparity, least, least confidence of any pixel and of a far one, columns cropped at the left and at
-    the right, least texture of any pixel, disparity below which more is asked for, and how much.
+    the right, least texture of any pixel, disparity below which more is required, and how much.
     """
     height, width = disparity.shape
     nearest, farthest, least, least_far = settings[0], settings[1], settings[2], settings[3]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of semi-global matching in 8 bits. All arithmetic is in whole numbers: the same on every processor.
+"""Kernels of semi-global matching in 8 bits. All arithmetic is in integers: identical on every processor.
 
-Arrays whose last axis is the disparity d hold the costs of one pixel side by side, so that a vector register takes
-many of them. The right image lies mirrored: what left pixel u shows at disparity d, it has at width - 1 - u + d.
+Arrays whose last axis is the disparity d hold the costs of one pixel next to each other, so that a vector register
+takes many of them. The right image is mirrored: the match of left pixel u at disparity d is at width - 1 - u + d.
 
-How it is written, the compiler dictates: loops over a block of a length that it knows become straight vector code, but
+The compiler dictates the style: loops over a block of known length become straight vector code, but
 only with unsigned indices (others may count from the end) and with every result cut to its bytes at once. A comparison
 becomes a mask by arithmetic, as in `_claim`; as a choice it would become a branch, and the loop one pixel at a time.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stereovox.kernels._jit import cell, kernel
 
 PLANES = 9
-"""Bytes by which a pixel is compared: its gradient with the least and the most within half a pixel, the same of its
+"""Bytes that describe a pixel: its gradient with the least and the most within half a pixel, the same of its
 grey value, and the census in three."""
 RIM = 3
 """Rows and columns that an image needs beyond its own: half the census window of 7 by 7 pixels."""
@@ -28,13 +28,13 @@ CAP = np.int32(63)
 MAX_COST = 63 + 63 + 24
 """Largest cost of a pixel: of its gradient, its grey value, and its census."""
 BLOCK = 64
-"""Disparities of a block; they come in whole blocks."""
+"""Disparities of a block; their number is a multiple of this."""
 MARGIN = 32
 """Bytes before and behind the path costs of a pixel."""
 CENSUS = tuple((y, x) for y in range(-RIM, RIM + 1) for x in range(-RIM, RIM + 1) if (x + y) % 2 == 0 and (x or y))
-"""Where the 24 bits of the census look: the pixels of one colour of a chess board of 7 by 7."""
+"""Offsets of the census's 24 bits: the pixels of one colour of a 7 by 7 chess board."""
 NONE = np.int16(-16)
-"""No disparity, as OpenCV's matchers say it."""
+"""No disparity, in the notation of OpenCV's matchers."""
 LANES, PAD, BEFORE_PAD, BEHIND_PAD = np.uint64(BLOCK), np.uint64(MARGIN), np.uint64(MARGIN - 1), np.uint64(MARGIN + 1)
 LEFT, RIGHT, ONE_ON, TWO_ON = np.uint64(RIM - 2), np.uint64(RIM), np.uint64(1), np.uint64(2)
 ZERO, ONE, TWO, FOUR, FULL = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(255)
@@ -44,12 +44,13 @@ NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), n
 
 
 class Settings(NamedTuple):
-    """What `match` is given, in whole numbers.
+    """Settings of `match`, in integers.
 
-    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of
-    grey between both pixels. unique: per cent by which the second best match must be worse. left_right: most by which
-    the disparities of both images may differ, in pixels; negative: any. share: a window's sum of costs times this,
-    without its lower 16 bits, is the pixel's cost, at most 255 - p1 - the greatest of `jumps`. disparities: those that
+    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) cost of larger ones, by the
+    step
+    of grey between both pixels. unique: per cent by which the second best match must be worse. left_right: largest
+    difference of the disparities of both images, in pixels; negative: any. share: a window's sum of costs times this,
+    without its lower 16 bits, is the pixel's cost, at most 255 - p1 - the greatest of `jumps`. disparities: number that
     may be chosen.
     """
 
@@ -63,12 +64,12 @@ class Settings(NamedTuple):
 
 
 class StripScratch(NamedTuple):
-    """Room for a strip of images of width w, n disparities; nothing in it outlives a strip but the margins.
+    """Memory for a strip of images of width w, n disparities; only the margins keep their values between strips.
 
     rows: (2 radius + 2, w, n) uint8, costs of single pixels, of the rows in the window. sums: (w, n) uint16 of the
     window's columns. window: (n,) uint16. costs: (w, n) uint8. across, down: (2, w, MARGIN + n + MARGIN) uint8, path
-    costs; their margins hold 255 - p1, which never is the least. lows: (w,) uint8. total: (n,) uint16. numbers:
-    (n,) uint16, 0 to n - 1. rival, owner: (w + n,) uint16, of pixels of the right image the least cost and its
+    costs; their margins hold 255 - p1, which is never the least. lows: (w,) uint8. total: (n,) uint16. numbers:
+    (n,) uint16, 0 to n - 1. rival, owner: (w + n,) uint16, for pixels of the right image the least cost and its
     disparity.
     """
 
@@ -87,9 +88,9 @@ class StripScratch(NamedTuple):
 
 @kernel
 def soften(image, first, end, soft):
-    """Fill rows `first` to `end` of `soft` (h, w) uint8 with weighed means of 3 by 3 pixels of `image` (h, w) uint8.
+    """Fill rows `first` to `end` of `soft` (h, w) uint8 with weighted means of 3 by 3 pixels of `image` (h, w) uint8.
 
-    Its census changes less with noise, and where one eye's rows lie lower; gradients are as soft along columns.
+    Its census changes less with noise and vertical misalignment of the eyes; gradients are smoothed along columns too.
     image: with its rim, in which the edge is repeated.
     """
     last = image.shape[0] - 1
@@ -103,7 +104,7 @@ def _soften(above, here, below, soft):
     for u in range(np.uint64(1), last):
         before, after = _column(above, here, below, u - ONE_ON), _column(above, here, below, u + ONE_ON)
         soft[u] = _mean(before, _column(above, here, below, u), after)
-    soft[0], soft[last] = soft[1], soft[last - ONE_ON]  # in the rim, neighbours are alike
+    soft[0], soft[last] = soft[1], soft[last - ONE_ON]  # in the rim, neighbours are equal
 
 
 @cell
@@ -118,10 +119,10 @@ def _mean(before, here, after):
 
 @kernel
 def describe(image, soft, first, end, sign, line, planes):
-    """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8: what the pixels of an image are compared by.
+    """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8 with the descriptors of an image's pixels.
 
-    image, soft: (h + 2 RIM, w + 2 RIM) uint8, its rim included, and what `soften` makes of it. sign: 1, or -1 for an
-    image that is mirrored.
+    image, soft: (h + 2 RIM, w + 2 RIM) uint8, including the rim, and the result of `soften`. sign: 1, or -1 for a
+    mirrored image.
     line: (w + 2,) uint8, scratch.
     """
     for v in range(first, end):
@@ -165,8 +166,9 @@ def _darker(there, here, weight, bits):
 def match(left, right, start, first, end, settings, scratch, raw):
     """Fill rows `first` to `end` of `raw` (h, w) int16 with disparities in 1/16 px by paths right, left and down.
 
-    left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored; both of `describe`. start: the row from which on costs
-    go down. settings: Settings; scratch: StripScratch. Without a value: NONE.
+    left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored; both from `describe`. start: the row from which the
+    downward
+    path starts. settings: Settings; scratch: StripScratch. Without a value: NONE.
     """
     height, radius = raw.shape[0], np.int64(settings.radius)
     p1, jumps, share = np.uint8(settings.p1), settings.jumps, np.uint32(settings.share)
@@ -201,7 +203,7 @@ def enter(left, right, v, costs, sums, blocks):
 
 @cell
 def _unlike(here, slope, slope_least, slope_most, grey, grey_least, grey_most, costs, blocks):
-    """Fill `costs` with what gradients and grey values differ by (Birchfield and Tomasi 1998), weighed 2 to 1."""
+    """Fill `costs` with the differences of gradients and grey values (Birchfield and Tomasi 1998), weighted 2 to 1."""
     s, s_least, s_most, g, g_least, g_most = here[0], here[1], here[2], here[3], here[4], here[5]
     for block in range(blocks):
         for i in range(LANES):
@@ -213,7 +215,7 @@ def _unlike(here, slope, slope_least, slope_most, grey, grey_least, grey_most, c
 
 @cell
 def _census_unlike(here, first, second, third, costs, sums, blocks):
-    """Add the bits of the census that differ to `costs`, and these to `sums`."""
+    """Add the number of differing census bits to `costs`, and these to `sums`."""
     a, b, c = here[6], here[7], here[8]
     for block in range(blocks):
         for i in range(LANES):
@@ -227,13 +229,13 @@ def _census_unlike(here, first, second, third, costs, sums, blocks):
 
 @cell
 def _apart(a, a_least, a_most, b, b_least, b_most):
-    """Return how far two values are from all that the other takes within half a pixel, the less of both ways."""
+    """Return the distance of each value from the other's range within half a pixel, the smaller of both."""
     return min(max(_less(a, b_most), _less(b_least, a)), max(_less(b, a_most), _less(a_least, b)))
 
 
 @cell
 def _less(a, b):
-    """Return a - b, or 0 where that is negative."""
+    """Return a - b, or 0 if that is negative."""
     return np.uint8(max(a, b) - b)
 
 
@@ -252,7 +254,7 @@ def _ones(x, y, z):
 
 @kernel
 def leave(costs, sums, blocks):
-    """Take the `costs` (w, n) of a row that leaves the window from `sums` (w, n)."""
+    """Subtract the `costs` (w, n) of a row that leaves the window from `sums` (w, n)."""
     for u in range(sums.shape[0]):
         for block in range(blocks):
             for i in range(LANES):
@@ -262,7 +264,7 @@ def leave(costs, sums, blocks):
 
 @kernel
 def smooth(sums, radius, share, window, costs, blocks):
-    """Fill `costs` (w, n) with the means of windows from the sums of their columns; columns beyond repeat the last."""
+    """Fill `costs` (w, n) with window means from the sums of columns; beyond the last column, repeat it."""
     width = costs.shape[0]
     window[:] = np.uint16(0)
     for u in range(-radius, radius):
@@ -299,10 +301,10 @@ def _begin(costs, path, blocks):
 
 @kernel
 def downward(costs, of, begins, p1, jumps, above, grey, lows, into, blocks):
-    """Fill the path down `into` (w, MARGIN + n + MARGIN) from that of the row above, unless it `begins` here.
+    """Fill the downward path `into` (w, MARGIN + n + MARGIN) from that of the row above, unless it `begins` here.
 
     above, grey: (w,) uint8, the image in that row and in this. jumps: of `Settings`. lows: (w,) the least of each
-    pixel's path costs, replaced.
+    pixel's path costs, updated.
     """
     for u in range(costs.shape[0]):
         if begins:
@@ -332,7 +334,7 @@ def _jump(jumps, before, here):
 
 @cell
 def _step(costs, before, low, p1, p2, after, blocks):
-    """Fill `after` with the costs of a path one pixel on (Hirschmueller 2008, Eq 13); return the least."""
+    """Fill `after` with the costs of a path one pixel further (Hirschmueller 2008, Eq 13); return the least."""
     jump, least = np.uint8(low + p2), FULL
     for block in range(blocks):
         here = FULL
@@ -387,7 +389,7 @@ def _add(right, left, down, total, blocks):
 
 @cell
 def _drop(total, n):
-    """Make disparities from n on unattractive; return the least cost of the others."""
+    """Exclude disparities from n on by high costs; return the least cost of the others."""
     least = FAR
     for d in range(n):
         least = min(least, total[d])
@@ -398,7 +400,7 @@ def _drop(total, n):
 
 @cell
 def _claim(total, numbers, least, rival, owner, blocks):
-    """Return the first disparity of least cost; note which one each pixel of the right image likes best."""
+    """Return the first disparity of least cost; note the best one of each pixel of the right image."""
     best = FAR
     for block in range(blocks):
         first = FAR
@@ -417,7 +419,7 @@ def _claim(total, numbers, least, rival, owner, blocks):
 
 @cell
 def _second(total, numbers, best, blocks):
-    """Return the least cost of all disparities but `best` and those next to it."""
+    """Return the least cost of all disparities except `best` and its neighbours."""
     least, before = FAR, np.uint16(best - SINGLE)
     for block in range(blocks):
         here = FAR

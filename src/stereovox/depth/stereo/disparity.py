@@ -20,11 +20,11 @@ RADIUS = 10
 TALL = 5
 """Half height of the upright one, 11 rows by 3 columns."""
 FAR_PX = 0.5
-"""Smaller disparities are none: the pixel is too far to have a depth."""
+"""Smaller disparities are dropped: the pixel is too far to have a depth."""
 SURE = 0.5
 """Confidence that TOO_FAR needs, since it clears everything before it."""
 DOUBTFUL_PX, SEEN = 3.0, 4.0
-"""Matchers tend to find small disparities if there is no texture: below 3 px at least this much is needed."""
+"""Without texture, matchers tend to find small disparities: below 3 px at least this much texture is needed."""
 DOWN, ACROSS = 3, 7
 """Half sizes of the texture window, 7 rows and 15 columns."""
 
@@ -35,7 +35,7 @@ class Disparity:
 
     disparity: (height, width) float32, pixels of the full image; NaN: none.
     confidence: (height, width) float32 from 0 (a guess) to 1 (certain); 0 without a value.
-    reason: (height, width) uint8 of `Reason`, VALID where there is a disparity.
+    reason: (height, width) uint8 of `Reason`, VALID if there is a disparity.
     """
 
     disparity: NDArray[np.float32]
@@ -44,9 +44,9 @@ class Disparity:
 
 
 def match_aligned(match: Matcher, left: Image, right: Image, aligned: str) -> NDArray[np.float32]:
-    """Return the raw disparity (height, width) of the left or the right image, both seen from its own eye.
+    """Return the raw disparity (height, width) of the left or the right image, each in its own eye's pixels.
 
-    Matchers know the left image only; a mirrored pair has its right image there.
+    Matchers compute it for the left image only; in a mirrored pair the right image takes that role.
     """
     if aligned == "left":
         return match(left, right)
@@ -55,7 +55,7 @@ def match_aligned(match: Matcher, left: Image, right: Image, aligned: str) -> ND
 
 
 def halved(image: Image) -> Image:
-    """Return the image whose pixels are means of 2 by 2; an odd last row or column is doubled before."""
+    """Return the image whose pixels are means of 2 by 2; an odd last row or column is first repeated."""
     import cv2
 
     height, width = image.shape
@@ -64,9 +64,10 @@ def halved(image: Image) -> Image:
 
 
 def doubled(disparity: NDArray[np.float32], shape: tuple[int, int], threads: int = 1) -> NDArray[np.float32]:
-    """Return a disparity of halved images in full pixels, cut to `shape`: linear where smooth, else each four times.
+    """Return a disparity of halved images in full pixels, cut to `shape`: linear where smooth, else each value four
+    times.
 
-    Smooth is where the two differ by less than a pixel; edges stay where they are.
+    A pixel is smooth if the two differ by less than a pixel; edges stay in place.
     """
     full = np.empty(shape, np.float32)
 
@@ -80,10 +81,10 @@ def doubled(disparity: NDArray[np.float32], shape: tuple[int, int], threads: int
 def confidence(disparity: NDArray[np.float32], threads: int = 1) -> NDArray[np.float32]:
     """Return the confidence of each disparity (height, width), 0 to 1: the mean of share^3 / (1 + off) in two windows.
 
-    One spans 21 by 21 pixels, the other 11 rows by 3 columns: a pole fills that one, and nothing else of the first.
-    share: of the window's pixels that have a disparity: where matching failed nearby, the rest is mostly chance. off:
-    between the disparity and the window's mean, in pixels / (1 + 0.1 disparity). Both were chosen, out of the matching
-    cost, its margin and curvature, texture and others, for how well they rank errors (docs/stereo.md).
+    One spans 21 by 21 pixels, the other 11 rows by 3 columns: a pole fills the second, but little of the first.
+    share: of the window's pixels that have a disparity; if matching failed nearby, the rest is mostly chance. off:
+    between the disparity and the window's mean, in pixels / (1 + 0.1 disparity). Both were chosen over the matching
+    cost, its margin and curvature, texture and others, because they rank errors best (docs/stereo.md).
     """
     height, width = disparity.shape
     sure = np.empty_like(disparity)
@@ -97,7 +98,7 @@ def confidence(disparity: NDArray[np.float32], threads: int = 1) -> NDArray[np.f
 
 
 def texture(image: Image, threads: int = 1) -> NDArray[np.float32]:
-    """Return the mean step of grey over two columns (height, width) float32 in a window of 7 rows and 15 columns."""
+    """Return the mean grey step over two columns (height, width) float32 in a window of 7 rows and 15 columns."""
     height, width = image.shape
     steps = np.empty(image.shape, np.float32)
 
@@ -115,9 +116,10 @@ def explained(
     """Return the disparity with confidence and reasons; `raw` (height, width), in full pixels, is changed.
 
     image: (height, width) uint8 that `raw` is aligned with. valid, valid_other: (height, width) bool of that image and
-    of the other, None: all may be used. A pixel is MASKED where it or its match is, and where it lies in the cropped
-    columns. TOO_NEAR: the best match is the last one searched, a nearer one may be missing. TOO_FAR: surely less than
-    half a pixel, with texture. All else without a value is UNMATCHED.
+    of the other, None: all may be used. A pixel is MASKED if it or its match is, and in cropped
+    columns. TOO_NEAR: the best match is the last one searched; a nearer one may be missing. TOO_FAR: certainly less
+    than
+    half a pixel, with texture. Other pixels without a value are UNMATCHED.
     """
     right = config.aligned == "right"
     side = 1 if right else -1

@@ -25,7 +25,7 @@ class Matcher(Protocol):
     """A stereo matcher.
 
     Args:
-        config: Settings of stereo matching; their lengths count pixels of the images that the matcher will get.
+        config: Settings of stereo matching; lengths are in pixels of the images passed to the matcher.
 
     Raises:
         ConfigError: The settings do not suit the method.
@@ -39,7 +39,7 @@ class Matcher(Protocol):
 
         Args:
             left: (height, width) uint8, rectified.
-            right: The same for the right eye: what the left image shows at (u, v), it shows at (u - disparity, v).
+            right: The same for the right eye: the match of left pixel (u, v) is at (u - disparity, v).
 
         Returns:
             (height, width) float32 pixels; NaN: no value.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stereo network that the user has as an ONNX file: two images in, a disparity out."""
+"""A user's stereo network in an ONNX file: two images in, a disparity out."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Network:
     """Runs the network in `stereo.model` on the CPU.
 
     Its inputs: the left image, then the right, (1, C, H, W) with C 1 or 3 (grey three times), float32 0 to 255, or
-    uint8. What scaling it wants must be in the file. Where H and W are fixed, images are put in the upper left corner
-    and cut or filled with their border; where free, filled to multiples of 32. Its first output: the left image's
-    disparity in pixels, with H and W last. Negative, not finite, and more than `disparities`: none.
+    uint8. Any scaling must be part of the network. If H and W are fixed, images are put in the upper left corner
+    and cut or padded with their border; if free, padded to multiples of 32. Its first output: the left image's
+    disparity in pixels, with H and W last. Negative, infinite or NaN values and those above `disparities` are dropped.
     """
 
     def __init__(self, config: StereoConfig) -> None:
-        """Raises ConfigError for a file that is missing or is no such network, MissingExtra without onnxruntime."""
+        """Raises ConfigError if the file is missing or not such a network, MissingExtra without onnxruntime."""
         if config.model is None:
             raise ConfigError("stereo.method 'onnx' needs a network: set stereo.model to an .onnx file")
         self._path, self._most = config.model, config.disparities
@@ -41,7 +41,9 @@ class Network:
         height, width = left.shape
         size = next(iter(feed.values())).shape[2:]
         if out.shape[-2:] != size or out.size != size[0] * size[1]:
-            raise ConfigError(f"{self._path}: gives {out.shape} for images {size}; a disparity of their size is needed")
+            raise ConfigError(
+                f"{self._path}: gives {out.shape} for images {size}; it must give a disparity of their size"
+            )
         full = np.full(left.shape, np.nan, np.float32)
         part = out.reshape(size)[:height, :width]
         full[: part.shape[0], : part.shape[1]] = np.where((part >= 0) & (part <= self._most), part, np.nan)
@@ -59,7 +61,7 @@ def _session(path: str, threads: int) -> Any:
     options.intra_op_num_threads = threads
     try:
         return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own exception types differ from version to version
+    except Exception as error:  # its exception types differ between versions
         raise ConfigError(f"{path}: not an ONNX network ({str(error).splitlines()[0]})") from None
 
 

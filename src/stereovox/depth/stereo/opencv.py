@@ -17,7 +17,7 @@ from stereovox.errors import ConfigError, FrameRefused
 COUNTS = 16
 """OpenCV counts disparities in sixteenths of a pixel."""
 ROUNDED = -1 / 32
-"""It rounds up: on planes all its matchers give 0.03 px too much."""
+"""OpenCV rounds up: on planes all its matchers give 0.03 px too much."""
 LOCKING = 0.62
 """Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 restores their uniform distribution."""
 PREFILTER = 63
@@ -37,7 +37,7 @@ class _OpenCv:
 
     def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the disparity of the left image, see `Matcher`."""
-        margin = self._config.disparities  # OpenCV leaves so many columns at the left without a value
+        margin = self._config.disparities  # OpenCV leaves this many columns at the left without a value
         wider = [np.pad(image, ((0, 0), (margin, 0)), mode="edge") for image in (left, right)]
         with _threads(self._config.threads):
             raw = self._compute(*wider)[:, margin:]
@@ -75,9 +75,9 @@ class _SemiGlobal(_OpenCv):
 
 
 class ThreeWay(_SemiGlobal):
-    """Three paths: from the left, from the right, and from above, or from below.
+    """Three paths: from the left, from the right, and from above or below.
 
-    Its one vertical path drags disparities along: a slanted plane comes out `lag_rows` rows late. That is taken back.
+    Its single vertical path delays disparities: a slanted plane comes out `lag_rows` rows late. This is corrected.
     """
 
     mode = "SGBM_3WAY"
@@ -107,7 +107,7 @@ class FourWay(_SemiGlobal):
 
 
 class Block(_OpenCv):
-    """Block matching: fast, and without values if there is no texture. Windows are at least 5 pixels wide."""
+    """Block matching: fast, but without values in areas without texture. Windows are at least 5 pixels wide."""
 
     def _make(self, config: StereoConfig) -> Any:
         import cv2
@@ -116,7 +116,7 @@ class Block(_OpenCv):
         matcher.setUniquenessRatio(config.uniqueness)
         matcher.setDisp12MaxDiff(_left_right(config))
         matcher.setSpeckleWindowSize(config.speckle_size)
-        matcher.setSpeckleRange(max(1, round(config.speckle_range * COUNTS)))  # in its raw counts, other than SGBM
+        matcher.setSpeckleRange(max(1, round(config.speckle_range * COUNTS)))  # in raw counts, unlike SGBM
         return matcher
 
     def _compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
@@ -126,7 +126,7 @@ class Block(_OpenCv):
 
 
 def _fractions(locking: float) -> NDArray[np.float32]:
-    """Return what the 16 fractions of a pixel stand for; those from a half on are seen from the next whole pixel."""
+    """Return the value of the 16 fractions of a pixel; from a half on they count from the next whole pixel."""
     counts = np.arange(COUNTS) / COUNTS
     nearest = np.round(counts)
     off = counts - nearest
@@ -134,12 +134,12 @@ def _fractions(locking: float) -> NDArray[np.float32]:
 
 
 def _left_right(config: StereoConfig) -> int:
-    return max(1, round(config.left_right)) if config.left_right else config.disparities  # SGBM makes 1 of less
+    return max(1, round(config.left_right)) if config.left_right else config.disparities  # SGBM turns less into 1
 
 
 @contextmanager
 def _threads(wanted: int) -> Iterator[None]:
-    """Set the number of OpenCV's threads; restored afterwards."""
+    """Set the number of OpenCV's threads, and restore it afterwards."""
     import cv2
 
     before = cv2.getNumThreads()

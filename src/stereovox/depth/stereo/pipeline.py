@@ -21,9 +21,9 @@ from stereovox.kernels.threads import in_shards, shards
 __all__ = ["Disparity", "StereoDepth"]
 
 ROWS = 32
-"""Rows that become depth at once."""
+"""Rows that are converted to depth at once."""
 LARGE = 450_000
-"""Images of more pixels are halved where `stereo.halve` is not set: street cameras, not 848x480 ones."""
+"""Larger images are halved if `stereo.halve` is not set: street cameras, but not 848x480 ones."""
 
 
 class StereoDepth:
@@ -37,9 +37,9 @@ class StereoDepth:
     def __call__(self, frame: StereoFrame) -> Frame:
         """Return the frame as a depth image: float32 metres, reasons, camera and pose of the aligned eye.
 
-        Depth is what `camera.depth_of` makes of the disparity, NaN: none. What is TOO_FAR has the depth beyond which
-        it is: a map that reaches farther does not take it for free. It is never UNKNOWN, but UNMATCHED where the
-        images do not agree, TOO_NEAR where the disparity is at the end of those searched, MASKED by rig and `rcrop`.
+        Depth is `camera.depth_of` the disparity, NaN: none. TOO_FAR pixels hold a lower bound of their
+        depth, so a map that reaches farther does not take them for free. No pixel is UNKNOWN, but UNMATCHED if the
+        images disagree, TOO_NEAR if the disparity is the largest searched, MASKED by rig and `rcrop`.
         Raises as `disparity`, and StereovoxError if the pair's camera has no baseline.
         """
         camera = frame.pair.camera
@@ -56,7 +56,7 @@ class StereoDepth:
         )  # fmt: skip
 
     def _depth(self, found: Disparity, camera: VirtualCamera) -> NDArray[np.float32]:
-        """Return the depth (height, width) in metres, a few rows at a time: so they stay in the cache."""
+        """Return the depth (height, width) in metres; a few rows at a time stay in the cache."""
         depth_m = np.empty(found.disparity.shape, np.float32)
 
         def fill(part: slice) -> None:
@@ -70,7 +70,7 @@ class StereoDepth:
         return depth_m
 
     def disparity(self, frame: StereoFrame) -> Disparity:
-        """Return the disparity of the aligned image, rectified before where the pair has `eyes`.
+        """Return the disparity of the aligned image, after rectification if the pair has `eyes`.
 
         Raises FrameRefused: the source's `fault`, `bad_dtype`, `bad_shape`.
         """
@@ -117,7 +117,7 @@ def _of_half(config: StereoConfig) -> StereoConfig:
 def _checked(mask: NDArray[np.bool_] | None, frame: StereoFrame) -> NDArray[np.bool_] | None:
     size = frame.pair.camera.height, frame.pair.camera.width
     if mask is not None and mask.shape != size:
-        raise StereovoxError(f"stereo pair '{frame.pair.name}': mask is {mask.shape}, its camera says {size}")
+        raise StereovoxError(f"stereo pair '{frame.pair.name}': mask is {mask.shape}, its camera has {size}")
     return mask
 
 
@@ -153,7 +153,7 @@ def grey(image: NDArray[np.uint8], size: tuple[int, int], name: str) -> NDArray[
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         raise FrameRefused("bad_dtype", f"{name} is {getattr(image, 'dtype', type(image).__name__)}; give uint8")
     if image.shape not in (size[::-1], (*size[::-1], 3)):
-        raise FrameRefused("bad_shape", f"{name} is {image.shape}, its camera says ({size[1]}, {size[0]})")
+        raise FrameRefused("bad_shape", f"{name} is {image.shape}, its camera has ({size[1]}, {size[0]})")
     if image.ndim == 2:
         return np.ascontiguousarray(image)
     import cv2
@@ -162,10 +162,10 @@ def grey(image: NDArray[np.uint8], size: tuple[int, int], name: str) -> NDArray[
 
 
 def _eye_pose(T_world_left: Transform, baseline: float, aligned: str) -> Transform:
-    """Return T_world_eye (4, 4): the right eye stands the baseline along x from the left."""
+    """Return T_world_eye (4, 4): the right eye is one baseline along x from the left."""
     T = matrix_of(T_world_left)
     if T.shape != (4, 4):
-        return T_world_left  # `prepare` refuses it, and says whether there is none
+        return T_world_left  # `prepare` refuses it with the reason
     if aligned == "right":
         T[:3, 3] += T[:3, 0] * baseline
     return T

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rectification: both images as the virtual camera of their pair would have taken them, rows on rows."""
+"""Rectification: both images as their pair's virtual camera would have taken them, with matching rows."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import StereoFrame
 
 ROWS = 64
-"""Rows of a map made at once: the lens needs some hundred bytes a pixel."""
+"""Rows of a map made at once: the lens model needs some hundred bytes a pixel."""
 
 
 class Maps(NamedTuple):
-    """Where a virtual camera's pixels are in an image.
+    """Positions of a virtual camera's pixels in an image.
 
-    columns, rows: (height, width) float32 pixels, -2 where the lens sees nothing. valid: (height, width) bool.
+    columns, rows: (height, width) float32 pixels, -2 outside the lens's view. valid: (height, width) bool.
     """
 
     columns: NDArray[np.float32]
@@ -42,9 +42,9 @@ _PREPARED: WeakKeyDictionary[StereoPair, _Prepared] = WeakKeyDictionary()
 def rectified(frame: StereoFrame) -> StereoFrame:
     """Return the frame with both images rectified to `pair.camera`, and a pair without eyes.
 
-    Unchanged where the pair has no eyes, and where the frame has a fault. `valid` and `valid_right` of the new pair are
-    False also if the lens sees nothing; the pixels there are 0. All frames of one pair get one and the same new
-    pair. Raises FrameRefused: `bad_shape` for images that are not of the lenses' sizes, `bad_dtype`.
+    Unchanged if the pair has no eyes or the frame has a fault. `valid` and `valid_right` of the new pair are
+    also False outside the lens's view; pixels there are 0. All frames of one pair share one new
+    pair. Raises FrameRefused: `bad_shape` for images of another size than the lenses', `bad_dtype`.
     """
     if frame.pair.eyes is None or frame.fault:
         return frame
@@ -54,7 +54,7 @@ def rectified(frame: StereoFrame) -> StereoFrame:
 
 
 def warped(image: NDArray[np.uint8], maps: Maps) -> NDArray[np.uint8]:
-    """Return an image (height, width) or (height, width, 3) taken where `maps` says, bilinear; 0 outside."""
+    """Return an image (height, width) or (height, width, 3) resampled at `maps`, bilinear; 0 outside."""
     import cv2
 
     taken = cv2.remap(image, maps.columns, maps.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
@@ -62,7 +62,7 @@ def warped(image: NDArray[np.uint8], maps: Maps) -> NDArray[np.uint8]:
 
 
 def maps_of(lens: Lens, R_lens_camera: NDArray[np.float64], camera: VirtualCamera) -> Maps:
-    """Return where `lens` shows what the pixels of `camera` see, turned by R_lens_camera (3, 3)."""
+    """Return where `lens` shows the rays of `camera`'s pixels, turned by R_lens_camera (3, 3)."""
     across, down = camera.rays()
     found = np.empty((camera.height, camera.width, 2), np.float32)
     for start in range(0, camera.height, ROWS):
@@ -105,7 +105,7 @@ def _check(frame: StereoFrame) -> None:
         if image.dtype != np.uint8:
             raise FrameRefused("bad_dtype", f"{name}: the {side} image is {image.dtype}; give uint8")
         if image.shape not in ((lens.height, lens.width), (lens.height, lens.width, 3)):
-            wanted = f"the lens of pair '{frame.pair.name}' says {(lens.height, lens.width)}"
+            wanted = f"the lens of pair '{frame.pair.name}' has {(lens.height, lens.width)}"
             raise FrameRefused(
                 "bad_shape", f"{name}: the {side} image is {image.shape}, {wanted}; calibrate at this size"
             )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From disparities to points, and how uncertain those are (Valenti 2018, chapter 4). Plain NumPy.
+"""From disparities to points, and their uncertainty (Valenti 2018, chapter 4). Plain NumPy.
 
-Points are in the optical frame of the eye whose image the disparities belong to: the thesis uses the right one. The
-thesis's misprints are put right: Eq 4.3 means sin((v - v0) dtheta_v), Eq 4.6 B (cos / tan - sin).
+Points are in the optical frame of the eye whose image the disparities belong to: the thesis uses the right one. Its
+misprints are corrected: Eq 4.3 means sin((v - v0) dtheta_v), Eq 4.6 B (cos / tan - sin).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Aligned = Literal["left", "right"]
 
 
 def reproject(disparity: ArrayLike, camera: VirtualCamera, aligned: Aligned = "left") -> NDArray[np.float64]:
-    """Return the points (height, width, 3) in metres that pixels with these disparities see.
+    """Return the points (height, width, 3) in metres of pixels with these disparities.
 
-    disparity: (height, width) in pixels of `camera`; NaN, infinity, zero and less mean "no value": NaN points.
+    disparity: (height, width) in pixels of `camera`; NaN, infinity, zero and less mean "no value" and give NaN points.
     camera: the virtual camera of both eyes. Frame: optical frame of the aligned eye (x right, y down, z forward).
     Pinhole: Valenti 2018, Eq 4.1; spherical: Eq 4.3 and 4.4, for the left eye with -d in place of +d in 4.4;
-    cylindrical: the pinhole's depth along rays that are even in angle from row to row.
+    cylindrical: the pinhole's depth along rays with equal angles between rows.
     """
     return _along_rays(camera.depth_of(usable(disparity), aligned), camera)
 
@@ -36,8 +36,8 @@ def point_sigma(
     """Return the standard deviations (height, width, 3) in metres of the three coordinates of each point.
 
     disparity_sigma: standard deviation of the disparity in pixels of `camera`. Pinhole: Valenti 2018, Eq 4.2;
-    spherical: Eq 4.7, which is the same for both eyes. First order: good while it is small against the disparity.
-    The three are of one error along the ray, so they are fully correlated.
+    spherical: Eq 4.7, which is the same for both eyes. First order: valid while it is small against the disparity.
+    All three come from one error along the ray, so they are fully correlated.
     """
     return np.abs(_along_rays(depth_sigma(disparity, camera, disparity_sigma, aligned), camera))
 
@@ -45,7 +45,7 @@ def point_sigma(
 def depth_sigma(
     disparity: ArrayLike, camera: VirtualCamera, disparity_sigma: float, aligned: Aligned = "left"
 ) -> NDArray[np.float64]:
-    """Return the standard deviation (height, width) in metres of the depth that `camera` measures.
+    """Return the standard deviation (height, width) in metres of the depth measured by `camera`.
 
     Pinhole and cylindrical: f B / d^2; spherical: B cos^2(column angle) dtheta / sin^2(d dtheta); times the
     disparity's standard deviation in pixels.
@@ -59,7 +59,7 @@ def depth_sigma(
 
 
 def usable(disparity: ArrayLike) -> NDArray[np.float64]:
-    """Return disparities of any shape with NaN for all that are not positive and finite."""
+    """Return disparities of any shape, with NaN for values that are not positive and finite."""
     d = np.asarray(disparity, float)
     return np.where(np.isfinite(d) & (d > 0), d, np.nan)
 

@@ -16,26 +16,26 @@ from stereovox.kernels.threads import Scratch, in_shards, shards
 
 Image = NDArray[np.uint8]
 COUNTS = 16
-"""Disparities are counted in sixteenths of a pixel, as by OpenCV, so that its speckle filter takes them."""
+"""Disparities are counted in sixteenths of a pixel, as in OpenCV, so that its speckle filter accepts them."""
 LOCKING = 0.7
 """Parabolas through the costs pull fractions to whole pixels: 0.5 (2 f)^0.7 spreads them."""
 LAG_ROWS = 0.35
-"""The one vertical path drags disparities along: a slanted plane comes out so many rows late."""
+"""The single vertical path delays disparities: a slanted plane comes out this many rows late."""
 STRIP, WARM = 90, 16
-"""Rows of a strip, nearly; and rows above it from which its path from above starts. Strips do not know of threads."""
+"""Approximate rows of a strip, and rows above it where its downward path starts. Strips do not depend on threads."""
 PENALTIES = 0.75
-"""`p1` and `p2` are those of costs of up to 200 (OpenCV's); these are MAX_COST at most."""
+"""`p1` and `p2` are meant for costs of up to 200 (OpenCV's); these are MAX_COST at most."""
 EDGE = 16
-"""Grey values between neighbours from which `p2` falls with their step: surfaces end where grey does (Hirschmueller
-2008, Eq 13). Three standard deviations of such a step where the image has noise of 4."""
+"""Grey step between neighbours above which `p2` falls with the step: surfaces end at grey edges (Hirschmueller
+2008, Eq 13). Three standard deviations of such a step if the image has noise of 4."""
 UNIQUE = 2 / 3
-"""Share of `uniqueness` that is asked for: the census differs in some bits even where the match is right."""
+"""Share of `uniqueness` that is required: the census differs in some bits even for correct matches."""
 
 
 class Census:
     """Own matcher: three paths, costs of Birchfield and Tomasi on gradients and grey values, and of a census.
 
-    It errs less than OpenCV's along three paths in 0.6 to 0.7 of the time, except where one eye stands a row lower
+    It errs less than OpenCV's along three paths in 0.6 to 0.7 of the time, except if one eye is a row lower
     (docs/stereo.md). Several threads may use it at the same time.
     """
 
@@ -69,7 +69,7 @@ class Census:
         return out
 
     def _raw(self, left: Image, right: Image) -> NDArray[np.int16]:
-        """Return the disparities (h, w) in 1/16 px, negative: none. Strips are matched at once by several threads."""
+        """Return the disparities (h, w) in 1/16 px, negative: none. Several threads match strips at once."""
         height, width = left.shape
         planes = self._described(left, 0, 1), self._described(right[:, ::-1], _whole(self._config.disparities), -1)
         raw = np.empty((height, width), np.int16)
@@ -84,7 +84,7 @@ class Census:
         return raw
 
     def _described(self, image: Image, beyond: int, sign: int) -> Image:
-        """Return what an image is compared by (PLANES, h, w + beyond); its edge is repeated beyond the last column."""
+        """Return an image's descriptors (PLANES, h, w + beyond); its edge is repeated beyond the last column."""
         import cv2
 
         height, width = image.shape
@@ -105,7 +105,7 @@ class Census:
         return planes
 
     def _strips(self, width: int) -> Scratch[StripScratch]:
-        """Return the memory for strips of images so wide; that of another width is given up."""
+        """Return the memory for strips of images of this width; memory for another width is released."""
         kept = self._scratch
         if kept is None or kept[0] != width:
             n = _whole(self._config.disparities)
@@ -119,10 +119,10 @@ def _whole(disparities: int) -> int:
 
 
 def _settings(config: StereoConfig) -> Settings:
-    """Return the settings in whole numbers, costs scaled down where path costs would not fit into 8 bits."""
+    """Return the settings as integers, with costs scaled down if path costs would not fit into 8 bits."""
     p1, p2 = PENALTIES * config.p1, PENALTIES * config.p2
     scale = min(1.0, (254 - 2) / (MAX_COST + p1 + p2))  # 2: both are rounded
-    most = max(1, round(config.left_right)) if config.left_right else -1  # half a pixel is less than it can say
+    most = max(1, round(config.left_right)) if config.left_right else -1  # its resolution is no finer than half a pixel
     return Settings(
         radius=config.block_size // 2,
         p1=round(scale * p1),
@@ -164,7 +164,7 @@ def _parts(count: int, threads: int) -> list[slice]:
 
 
 def _fractions(locking: float) -> NDArray[np.float32]:
-    """Return what the 16 fractions of a pixel stand for; those from a half on are seen from the next whole pixel."""
+    """Return the value of the 16 fractions of a pixel; from a half on they count from the next whole pixel."""
     counts = np.arange(COUNTS) / COUNTS
     nearest = np.round(counts)
     off = counts - nearest

@@ -177,7 +177,7 @@ MISTAKES = [
     ("did you mean 'projective'", ["map", "{rec}", "--out", "{tmp}/m", "--integrator", "projectiv"]),
     ("did you mean 'stereo'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "sensor.model=stero"]),
     ("unknown profile", ["map", "{rec}", "--out", "{tmp}/m", "--profile", "chien"]),
-    ("is no slice", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "1-5"]),
+    ("is not a slice", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "1-5"]),
     ("picks none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),

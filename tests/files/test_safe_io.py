@@ -143,7 +143,7 @@ def test_times_beyond_all_bounds(tmp_path, stamp):
     if stamp == "1e-999999999":
         assert read_tracker(tmp_path / "a.txt").stamps_ns.tolist() == [0]
         return
-    with pytest.raises(SourceError, match="is no time in seconds"):
+    with pytest.raises(SourceError, match="is not a time in seconds"):
         read_tracker(tmp_path / "a.txt")
 
 

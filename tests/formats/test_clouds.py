@@ -209,7 +209,7 @@ def test_a_kitti_scan(tmp_path):
     (tmp_path / "0.bin").write_bytes(data)
     size_and_bounds(import_map(tmp_path / "0.bin"), 0.05)
     (tmp_path / "0.bin").write_bytes(data + b"1234")
-    with pytest.raises(MapFileError, match="no whole number of points"):
+    with pytest.raises(MapFileError, match="not a whole number of points"):
         import_map(tmp_path / "0.bin")
     (tmp_path / "0.bin").write_bytes(np.full(400, 1e9, "<f4").tobytes())
     with pytest.raises(MapFileError, match="not a KITTI velodyne scan"):

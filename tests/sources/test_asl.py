@@ -138,7 +138,7 @@ def test_excerpts_and_slightly_different_times(tmp_path):
     (folder / "mav0/cam1/data.csv").unlink()
     source = open_source(folder)
     assert [frame.fault for frame in source] == [None, "missing_file"]
-    assert "names 3 images, 1 of them are not there" in "\n".join(source.notes)
+    assert "lists 3 images, 1 of them are missing" in "\n".join(source.notes)
 
 
 def test_a_bad_line_of_poses_costs_the_frames_beside_it(tmp_path):
@@ -182,7 +182,7 @@ def write(name, text):
         ),
         (remove("cam0/data"), r"cam0: holds no PNG; copy the images of cam0 there"),
         (write("cam0/data.csv", "5,none.png\n"), r"data\.csv: none of its 1 images is in .*data; copy them there"),
-        (write("cam0/data.csv", "5.5,none.png\n6.5,b.png"), r"data\.csv:2: '6\.5' is no time in whole nanoseconds"),
+        (write("cam0/data.csv", "5.5,none.png\n6.5,b.png"), r"data\.csv:2: '6\.5' is not a time in whole nanoseconds"),
         (write("cam0/data.csv", f"{START},../x.png\n"), r"data\.csv:1: '\.\./x\.png' leads out"),
         (write("state_groundtruth_estimate0/data.csv", poses_csv([5, 6])), "no time in common"),
         (write("state_groundtruth_estimate0/data.csv", "\n\n"), "holds no pose"),
@@ -206,7 +206,7 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(tmp_path, spoil, said):
 def test_positions_alone_are_no_poses(tmp_path):
     folder = asl(tmp_path)
     (folder / "mav0/state_groundtruth_estimate0").rename(folder / "mav0/leica0")
-    with pytest.raises(SourceError, match="leica0 has positions but no directions; put state_groundtruth"):
+    with pytest.raises(SourceError, match="leica0 has positions but no orientations; put state_groundtruth"):
         open_source(folder)
     (folder / "poses.txt").write_text(poses_text(START, START + STEP))
     assert len(open_source(folder)) == 2
@@ -241,6 +241,6 @@ def test_an_imu_can_be_left_out_and_a_damaged_one_says_so(tmp_path):
     assert open_source(f"{folder}?imu=off").imu() is None
     with pytest.raises(SourceError, match="imu=on must be off"):
         open_source(f"{folder}?imu=on")
-    with pytest.raises(SourceError, match="is no time in whole nanoseconds"):
+    with pytest.raises(SourceError, match="is not a time in whole nanoseconds"):
         open_source(with_imu(tmp_path / "b", ["soon,1,2,3,4,5,6"])).imu()
     assert open_source(asl(tmp_path / "c")).imu() is None

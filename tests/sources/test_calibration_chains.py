@@ -140,10 +140,10 @@ def vins(folder, lenses):
 def test_vins_fusion(tmp_path, lenses):
     files = vins(tmp_path, lenses)
     check(import_rig(files), lenses)
-    with pytest.raises(SourceError, match="lens of one camera of VINS-Fusion; give the settings that name it"):
+    with pytest.raises(SourceError, match="one lens of VINS-Fusion; give the settings that name it"):
         import_rig([tmp_path / "left.yaml"])
     saved(tmp_path, "model_type: MEI", "right.yaml")
-    with pytest.raises(SourceError, match=r"right\.yaml: model_type 'MEI' is no lens we have \(PINHOLE, KANN"):
+    with pytest.raises(SourceError, match=r"right\.yaml: model_type 'MEI' is not supported \(PINHOLE, KANN"):
         import_rig(files)
     (tmp_path / "left.yaml").unlink()
     with pytest.raises(SourceError, match=r"left\.yaml: No such file"):
@@ -209,7 +209,7 @@ def test_basalt(tmp_path):
     assert pair.eyes.left == FISHEYE
     np.testing.assert_allclose(pair.eyes.T_left_right[:3, 3], [0.1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(pair.T_body_left[:3], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], atol=1e-9)
-    with pytest.raises(SourceError, match=r"intrinsics\[0\]: camera_type 'ds' is no lens we have"):
+    with pytest.raises(SourceError, match=r"intrinsics\[0\]: camera_type 'ds' is not supported"):
         import_rig(saved(tmp_path, basalt("ds")))
 
 
@@ -223,7 +223,7 @@ CONTRADICTION = [{**to_body()[0], "T_cam_imu": FORWARD.tolist()}, to_body()[1]]
         (kalibr(NARROW, [to_body()[0], {}]), "and cam1 has neither"),
         (kalibr(NARROW, CONTRADICTION), "cam0: T_imu_cam is not the inverse of T_cam_imu; remove the wrong one"),
         (kalibr(NARROW[:1], to_body()[:1]), "has cam0 but no cam1, so there is no stereo"),
-        (kalibr(NARROW, to_body(), "fov"), "cam0: pinhole-fov is no lens we have"),
+        (kalibr(NARROW, to_body(), "fov"), "cam0: pinhole-fov is not supported"),
         ({"cameras": [{"T_SC": 1}, 2]}, r"cameras\[0\]\.focal_length is missing"),
         ({"cameras": [1, 2]}, r"cameras\[0\]\.focal_length is missing"),
         ({"cam0_calib": "x"}, "has cam0_calib but no cam1_calib"),

@@ -84,7 +84,7 @@ def test_another_camera_for_any_source(tmp_path):
     other = with_camera(source, file)
     assert other.camera == replace(CAMERA, baseline=0.075)
     assert (other.name, other.length) == (source.name, 4)
-    told = f"{file} is used in place of the recording's own camera (depth correction 'scale')"
+    told = f"{file} is used instead of the recording's own camera (depth correction 'scale')"
     assert other.notes == other.after(1).notes == (*source.notes, told)
     frames = list(other)
     assert [frame.camera for frame in frames] == [other.camera] * 4
@@ -118,5 +118,5 @@ def test_images_need_no_poses(tmp_path):
 def test_a_rig_file_is_named_as_such(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text("[[pair]]\nname = 'front'\n")
-    with pytest.raises(SourceError, match="is a rig file, no camera file"):
+    with pytest.raises(SourceError, match="is a rig file, not a camera file"):
         read_camera(path)

@@ -97,7 +97,7 @@ COMPUTED = (
 )
 def test_a_database_that_would_compute(tmp_path, statements):
     path = database(tmp_path, *statements)
-    with pytest.raises(SourceError, match="topics or messages is no plain table"):
+    with pytest.raises(SourceError, match="topics or messages is not a plain table"):
         open_source(path)
 
 
@@ -188,7 +188,7 @@ def test_a_packed_log_that_swells(tmp_path, monkeypatch):
     path.write_bytes(bz2.compress(FLASER + b"#" * (1 << 22)))
     log = CarmenLog(str(path))
     assert len(log.scans) == 1
-    assert "swells to more than" in log.notes[-1]
+    assert "expands to more than" in log.notes[-1]
     path.write_bytes(bz2.compress(FLASER * 3))
     assert len(CarmenLog(str(path)).notes) == 1
 

@@ -201,7 +201,7 @@ def test_pictures_of_which_none_can_be_used_say_why(tmp_path, wrong):
         if wrong == "damaged":
             path.write_bytes(b"no picture")
     source = open_source(folder)
-    expected = "are they of one clock" if wrong == "clock" else r"rgb/100\.0+\.png: not read, or"
+    expected = "do they share a clock" if wrong == "clock" else r"rgb/100\.0+\.png: not read, or"
     for k in range(COUNT):
         with pytest.raises(FrameRefused, match=expected):
             pixels(source.frame(k).photo)

@@ -127,7 +127,7 @@ def test_lines_over_tcp_come_again_after_the_server_hung_up(monkeypatch):
             assert stream.counts["connections"] == 2
         finally:
             stream.stop()
-    assert "it is tried again" in stream.trouble
+    assert "trying again" in stream.trouble
 
 
 def test_a_stream_stops_while_nothing_comes(stream):

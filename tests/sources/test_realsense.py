@@ -165,7 +165,7 @@ def test_a_live_camera_counts_forwards_only(camera, frames):
 
 
 def test_more_frames_than_can_be_counted_are_refused(camera):
-    with pytest.raises(SourceError, match="give smaller numbers"):
+    with pytest.raises(SourceError, match="give smaller ones"):
         open_stream(STILL, f":{10**20}")
 
 

@@ -66,7 +66,7 @@ def test_one_rectified_folder_with_an_index(tmp_path):
 def test_what_cannot_be_opened(tmp_path):
     folder = recorded(tmp_path / "rig")
     (folder / "front/left/noon.png").write_bytes(b"")
-    with pytest.raises(SourceError, match="no time in nanoseconds"):
+    with pytest.raises(SourceError, match="not a time in nanoseconds"):
         open_source(folder)
     (folder / "front/left/noon.png").unlink()
     (folder / "poses.txt").unlink()

@@ -58,7 +58,7 @@ def test_other_ways_of_writing(tmp_path):
     assert open_source(scene(tmp_path / "b", brackets=False)).camera == camera
     metres = open_source(scene(tmp_path / "c", baseline=0.1))
     assert metres.camera == camera
-    assert "baseline=0.1 is taken for metres" in "\n".join(metres.notes)
+    assert "baseline=0.1 is assumed to be metres" in "\n".join(metres.notes)
     larger = open_source(scene(tmp_path / "d", times=4))
     assert larger.camera.cx == pytest.approx(75)
     assert larger.camera.fx == pytest.approx(100)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of rays from one point at triangles: LANES neighbouring rays go through a tree of boxes together.
+"""Kernels for rays from one point at triangles: LANES neighbouring rays traverse a tree of boxes together.
 
-What decides about a hit is rounded as NumPy rounds it, so that simulations are the same on every processor.
+Operations that decide about a hit are rounded as in NumPy, so that simulations are the same on every processor.
 """
 
 import numpy as np
@@ -9,22 +9,22 @@ import numpy as np
 from stereovox.kernels._jit import cell, exact_cell, kernel
 
 LANES = 32
-"""Rays that go together. Of an image these lie side by side, and mostly meet the same boxes."""
+"""Rays traversed together. In an image they are neighbours, and mostly meet the same boxes."""
 ZERO, ONE = np.float32(0), np.float32(1)
 FAR = np.float32(np.inf)
 WIDER = np.float32(1 + 1e-6)
-"""So much later than calculated a ray leaves a box: rounding must not lose a surface that lies in its side."""
+"""Tolerance on the exit of a ray from a box, so that rounding does not lose a surface in its side."""
 SLOWEST = np.float32(1e-30)
-"""Stands for a direction's component of 0, which cannot be divided by."""
+"""Replaces a direction's component of 0, to allow division."""
 NO_TRIANGLE = np.int32(-1)
 ROOT = np.int32(1)
 
 
 @kernel
 def look(triangles, origin, sides, planes):
-    """Fill in what triangles (M, 3, 3) with corners A, B, C are like, seen from `origin` (3,), all float64.
+    """Fill in the properties of triangles (M, 3, 3) with corners A, B, C, seen from `origin` (3,), all float64.
 
-    sides: (M, 9) float64, the products B x C, C x A and A x B. A ray along d passes within the triangle where its
+    sides: (M, 9) float64, the products B x C, C x A and A x B. A ray along d passes inside the triangle if its
     products with all three have one sign: these are the volumes of Pluecker's coordinates, and triangles that share a
     side agree on it. planes: (M, 4) float64, the normal (B - A) x (C - A), and its product with A.
     """
@@ -45,12 +45,12 @@ def look(triangles, origin, sides, planes):
 
 @kernel
 def nearest(directions, boxes, starts, sides, planes, rays, found, waiting, share, triangle):
-    """Fill in how often each of `directions` (N, 3) float32 fits before the first triangle, and which that is.
+    """Fill in the distance to the first triangle in units of each of `directions` (N, 3) float32, and its number.
 
     boxes: (nodes, 6) float32, the lowest and the highest corner seen from the origin; the children of node i are 2 i
     and 2 i + 1, the first is 1. starts: (leaves + 1,) int32, the first triangle of each leaf. sides, planes: of `look`.
-    rays: (7, LANES) float32, found: (LANES,) int32, waiting: (64,) int32, room to work in.
-    share: (N,) float32, inf without any; triangle: (N,) int32, -1 without any; of several equally far the first.
+    rays: (7, LANES) float32, found: (LANES,) int32, waiting: (64,) int32, scratch.
+    share: (N,) float32, inf without any; triangle: (N,) int32, -1 without any; of several equally far, the first.
     """
     leaves = np.int32(starts.shape[0] - 1)
     for first in range(0, directions.shape[0], LANES):
@@ -78,7 +78,7 @@ def nearest(directions, boxes, starts, sides, planes, rays, found, waiting, shar
 
 @cell
 def _start(directions, first, count, rays, found):
-    """Lay out directions, their inverses, and that nothing is met yet; the last ray stands for those that lack."""
+    """Set up directions, their inverses and empty results; the last ray fills missing lanes."""
     for k in range(LANES):
         n = first + min(k, count - 1)
         for axis in range(3):
@@ -91,7 +91,7 @@ def _start(directions, first, count, rays, found):
 
 @cell
 def _any_enters(boxes, node, rays):
-    """Return whether any ray enters the box before the nearest surface that it met (Kay and Kajiya 1986)."""
+    """Return whether any ray enters the box before its nearest surface so far (Kay and Kajiya 1986)."""
     x0, y0, z0 = boxes[node, 0], boxes[node, 1], boxes[node, 2]
     x1, y1, z1 = boxes[node, 3], boxes[node, 4], boxes[node, 5]
     entered = np.int32(0)
@@ -107,7 +107,7 @@ def _any_enters(boxes, node, rays):
 
 @cell
 def _by_distance(boxes, child, rays):
-    """Return two children, first the one whose middle is nearer along the first ray."""
+    """Return two children, first the one whose centre is nearer along the first ray."""
     ahead = ZERO
     for axis in range(3):
         mine = boxes[child, axis] + boxes[child, 3 + axis]
@@ -120,7 +120,7 @@ def _by_distance(boxes, child, rays):
 
 @cell
 def _meet(sides, planes, m, rays, found):
-    """Let all rays meet triangle `m`."""
+    """Intersect all rays with triangle `m`."""
     ax, ay, az = sides[m, 0], sides[m, 1], sides[m, 2]
     bx, by, bz = sides[m, 3], sides[m, 4], sides[m, 5]
     cx, cy, cz = sides[m, 6], sides[m, 7], sides[m, 8]
@@ -139,7 +139,7 @@ def _meet(sides, planes, m, rays, found):
 
 @exact_cell
 def _minor(aq, ar, bq, br):
-    """Exactly the opposite where the two change places."""
+    """Antisymmetric exactly: swapping the two negates it."""
     return aq * br - ar * bq
 
 

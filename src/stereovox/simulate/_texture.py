@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel of the pattern on simulated surfaces: value noise in space, of several sizes (Perlin 1985)."""
+"""Kernel of the pattern on simulated surfaces: 3-D value noise of several sizes (Perlin 1985)."""
 
 import numpy as np
 
@@ -15,8 +15,8 @@ PER_UINT16 = np.float32(1 / 65535)
 def pattern(points, footprint, largest, octaves, out):
     """Fill `out` (N,) with brightness between -1 and 1 at points (N, 3) in metres.
 
-    Waves are `largest` metres long, then half of that, `octaves` times, all of about equal strength. A wave is left
-    out, softly, where it is shorter than two of the `footprint` (N,) that a pixel covers there: a lens blurs it too.
+    Waves are `largest` metres long, then half of that, `octaves` times, all of about equal strength. A wave is faded
+    out if it is shorter than two of the `footprint` (N,) that a pixel covers there, as a lens would blur it.
     """
     for n in range(points.shape[0]):
         total, weights = ZERO, np.float32(1e-6)
@@ -34,9 +34,9 @@ def pattern(points, footprint, largest, octaves, out):
 
 @kernel
 def even(points, seed, out):
-    """Fill `out` (N,) with noise of mean 0 and variance 1 at points (N, 3), alike where points are nearer than one.
+    """Fill `out` (N,) with noise of mean 0 and variance 1 at points (N, 3), correlated over distances below one.
 
-    A blend of random numbers varies less between them than at them; here that is made up for at each point.
+    A blend of random numbers varies less between them than at them; this is compensated at each point.
     """
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -46,14 +46,14 @@ def even(points, seed, out):
 
 @cell
 def _kept(x):
-    """Return what the blend along one axis leaves of the variance."""
+    """Return the share of the variance that blending along one axis keeps."""
     t = _smooth(x - np.floor(x))
     return t * t + (ONE - t) * (ONE - t)
 
 
 @cell
 def _value(x, y, z, seed):
-    """Return smooth noise between -1 and 1: random numbers at whole places, blended between."""
+    """Return smooth noise between -1 and 1: random numbers at integer points, blended in between."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     i, j, k = np.int32(fx), np.int32(fy), np.int32(fz)
     a, b, c = _smooth(x - fx), _smooth(y - fy), _smooth(z - fz)
@@ -82,7 +82,7 @@ def _between(a, b, t):
 
 @cell
 def _random(i, j, k, seed):
-    """Return a number between -1 and 1 that three whole numbers always give."""
+    """Return a number between -1 and 1 determined by three integers."""
     h = np.uint32(i) * np.uint32(0x8DA6B343) ^ np.uint32(j) * np.uint32(0xD8163841)
     h = h ^ np.uint32(k) * np.uint32(0xCB1AB31F) ^ (seed + np.uint32(1)) * np.uint32(0x9E3779B9)
     h = (h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D)

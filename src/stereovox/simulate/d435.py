@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simple model of a RealSense D435: disparity noise, holes next to edges, near and far limits, reasons told."""
+"""A simple model of a RealSense D435: disparity noise, holes next to edges, near and far limits, known reasons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereovox.geometry.se3 import Transform
 
 HFOV_DEG = 91.2
 CAMERA = PinholeCamera.from_field_of_view(848, 480, HFOV_DEG, baseline=0.05)
-"""The D435's depth camera: the image is the left eye's, the right eye stands one baseline along +x."""
+"""The D435's depth camera: the image is the left eye's; the right eye is one baseline along +x."""
 SHAPE = 480 / 848
 """Height over width of its images."""
 JUMP_PX = 1.0
@@ -26,18 +26,18 @@ JUMP_PX = 1.0
 class D435:
     """A stereo depth camera whose matching error is Gaussian in disparity, and new in each frame.
 
-    It is kinder than real ones (`stereovox.simulate.honest`), above all with independent noise and with reasons.
+    It is more benign than real ones (`stereovox.simulate.honest`), mainly by independent noise and known reasons.
 
     subpixel: standard deviation of the disparity in pixels (Chien 2020: 0.08).
     nearest, farthest: depths in metres the camera delivers.
     edge_px: half width of the matching window; background pixels that close to a nearer surface find no match.
-    edge_loss: share of the nearer surface's own border pixels that find none.
-    barrel: how much too far the left and right borders of the image are seen, as a share of the depth; it grows with
+    edge_loss: share of the nearer surface's own border pixels that find no match.
+    barrel: relative error by which the left and right borders of the image appear too far; it grows with
         the square of the distance from the optical axis (Chien 2020, App. A: 0.1).
-    correlation_px: standard deviation in pixels of the Gaussian that smooths the error, whose size stays; 0: it is
+    correlation_px: standard deviation in pixels of the Gaussian that smooths the error at constant size; 0: it is
         independent from pixel to pixel.
-    toe_in: angle in radians by which the right eye is turned without the camera knowing: a barrel as well, whose share
-        grows with the depth, as Chien 2020, App. A, says of his.
+    toe_in: angle in radians by which the right eye is rotated unknown to the camera: also a barrel, whose share
+        grows with the depth, as Chien 2020, App. A, reports.
     """
 
     camera: PinholeCamera = CAMERA
@@ -56,7 +56,7 @@ class D435:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
         true_depth_m: (height, width) along the optical axis, inf if there is nothing. Same seed, same image.
-        T_world_camera: for cameras whose errors stay with surfaces.
+        T_world_camera: for cameras whose errors are fixed to surfaces.
         """
         random = np.random.default_rng(seed)
         scale = self._disparity_at_one_metre
@@ -71,7 +71,7 @@ class D435:
         return np.where(reason == Reason.VALID, np.rint(depth * 1000), 0).astype(np.uint16), reason
 
     def distorted(self, true_depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what `barrel` and `toe_in` alone make of depth (height, width) in metres; inf stays far away."""
+        """Return the effect of `barrel` and `toe_in` alone on depth (height, width) in metres; inf stays far away."""
         if not (self.barrel or self.toe_in):
             return true_depth_m
         scale = self._disparity_at_one_metre
@@ -83,9 +83,9 @@ class D435:
         return np.float32(self.camera.fx * (self.camera.baseline or 0.0))
 
     def _misaligned(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity that eyes out of line see.
+        """Return the disparity of misaligned eyes.
 
-        An eye turned by a small angle a sees a point at slope x moved by f a (1 + x^2); calibration takes out f a.
+        An eye rotated by a small angle a sees a point at slope x moved by f a (1 + x^2); calibration removes f a.
         """
         if not (self.barrel or self.toe_in):
             return disparity
@@ -121,10 +121,10 @@ def classify(depth_m: NDArray[np.floating], nearest: float, farthest: float) -> 
 
 
 def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels of the left image (height, width) the right eye cannot see.
+    """Return the pixels of the left image (height, width) that the right eye cannot see.
 
-    Each pixel moves left by its disparity; where a nearer surface lands on the same pixel of the right image, or
-    where it leaves that image, there is nothing to match.
+    Each pixel moves left by its disparity; if a nearer surface lands on the same pixel of the right image, or
+    it leaves that image, there is nothing to match.
     """
     height, width = disparity.shape
     column = np.arange(width, dtype=np.float32) - disparity
@@ -139,12 +139,12 @@ def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def beside_nearer_surface(disparity: NDArray[np.float32], radius: int) -> NDArray[np.bool_]:
-    """Return which pixels have a nearer surface within `radius` pixels."""
+    """Return the pixels with a nearer surface within `radius` pixels."""
     return extreme(np.maximum, disparity, radius) > disparity + JUMP_PX
 
 
 def on_border(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels have a farther surface right next to them."""
+    """Return the pixels with a farther surface directly next to them."""
     return extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
 
 

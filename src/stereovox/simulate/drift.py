@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of a simulation that drift as a tracker's do."""
+"""Poses of a simulation that drift like a tracker's."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 from stereovox.simulate.t265 import OPENGL, STEP_S, Drift, drifted, start_frame
 
 YAW_DEG = 5.0
-"""Degrees by which the heading drifts over one metre where positions drift by one metre a metre: a tracker that is off
+"""Degrees of heading drift over one metre if positions drift by one metre a metre: a tracker that is off
 by 1 % turns by 0.05 degrees (see `Drift`)."""
 
 CameraPath = Callable[[float], Transform]
-"""T_world_camera (4, 4), optical axes, at a share of the way, 0 to 1."""
+"""T_world_camera (4, 4), optical axes, at a share of the path, 0 to 1."""
 
 
 def drifting(path: CameraPath, seconds: float, share: float, random: np.random.Generator) -> CameraPath:
-    """Return the path as a tracker reports it that never finds a place again.
+    """Return the path as reported by a tracker that never recognises a place.
 
     path: the true one, world z up; it takes `seconds`. share: metres of error per metre travelled, in all directions;
-    the heading drifts along (`YAW_DEG`), roll and pitch stay right. The first pose is true, and errors belong to places
-    on the way, not to images: they are the same for any number of frames. Raises StereovoxError if the first pose
+    the heading drifts too (`YAW_DEG`), roll and pitch stay right. The first pose is true, and errors belong to
+    positions
+    on the path, not to images: they are the same for any number of frames. Raises StereovoxError if the first pose
     has no heading.
     """
     shares = np.linspace(0, 1, max(2, math.ceil(seconds / STEP_S) + 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:flight`: kilometres through one long hall and back along it, cheap enough to render a whole flight."""
+"""`sim:flight`: kilometres along a hall and back, cheap enough to render a whole flight."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereovox.simulate.scene import Scene, Solid, box
 from stereovox.simulate.stage import Stage, within
 
 LANE = 2.0
-"""Metres between the hall's middle and the flight, on the right both ways; also the radius of the turn at the end."""
+"""Metres between the hall's middle and the path, on the right both ways; also the radius of the turn at the end."""
 HALF, HEIGHT = 5.0, 4.6
 """Half width and height of the hall."""
 BAY = 8.0
@@ -22,7 +22,7 @@ BEHIND, BEYOND = 6.0, 12.0
 """Metres of hall behind the start and beyond the turn."""
 THICKNESS = 0.2
 SEED = 0
-"""Of the hall's bays."""
+"""Seed of the hall's bays."""
 IMAGE_WIDTH = 212
 """Pixels across: a frame takes 5 ms."""
 
@@ -30,7 +30,7 @@ IMAGE_WIDTH = 212
 def stage(*, length: float = 2000.0, speed: float = 5.0) -> Stage:
     """Return a hall and a flight of `length` metres at `speed` m/s: half of it out, a U-turn, and back.
 
-    The hall is the same in every bay on average, and no two bays are equal. Images are 212 pixels wide, 30 a second.
+    Bays are statistically alike, but no two are equal. Images are 212 pixels wide, 30 a second.
     World: z up, x along the hall, origin on the floor in the hall's middle where the flight starts.
     Parts: `floor`, `ceiling`, `walls`, `pillars`, `boxes`, `beams`. Raises SourceError for values out of range.
     """
@@ -49,7 +49,7 @@ def stage(*, length: float = 2000.0, speed: float = 5.0) -> Stage:
 
 
 def _on_track(travelled: float, straight: float) -> Transform:
-    """Return T_world_camera after so many metres: out on the right, half a circle to the left, back on the right."""
+    """Return T_world_camera after this many metres: out on the right, half a circle to the left, back on the right."""
     if travelled <= straight:
         x, y, yaw = travelled, -LANE, 0.0
     else:

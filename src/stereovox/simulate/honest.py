@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth cameras that err as real ones do: alike in neighbouring pixels, in steps, with holes and mismatches.
+"""Depth cameras with realistic errors: correlated between neighbouring pixels, in steps, with holes and mismatches.
 
-The numbers of the presets were chosen so that `benchmarks/camera_noise.py` prints about the same of a simulation and of
+The numbers of the presets were chosen so that `benchmarks/camera_noise.py` prints similar values for simulations and
 recordings; docs/simulations.md shows both.
 """
 
@@ -22,25 +22,26 @@ from stereovox.simulate.floors.kinect import WIDTH, kinect_camera
 Image = NDArray[np.float32]
 
 ALIKE = 2.7
-"""Cells of `_texture.even` as wide as so many standard deviations of a Gaussian kernel make noise alike over as many
-pixels: both fall to 1/e at two standard deviations."""
+"""Cell size of `_texture.even`, in standard deviations of a Gaussian kernel, that gives noise of the same correlation
+length in pixels: both fall to 1/e at two standard deviations."""
 PATTERN_PX = 3.0
-"""Disparity in pixels over which the errors of a fixed pixel stay alike: the projected pattern is another one then."""
+"""Disparity in pixels over which the errors of a fixed pixel stay similar: beyond, another part of the pattern is
+seen."""
 BRIGHT_M, MEAN_GREY, SPREAD_GREY = 0.8, 115.0, 45.0
-"""Brightness of surfaces in grey levels: how far it stays alike in metres, its mean and standard deviation."""
+"""Brightness of surfaces in grey levels: its correlation length in metres, its mean and standard deviation."""
 DARK_GREY = 80.0
 """Grey below which a surface begins to lose values."""
 STEEP = 0.5
 """Cosine of the angle between ray and normal below which a surface begins to lose values."""
 TEXTURE_M = 0.6
-"""How large patches of repetitive texture are, in metres."""
+"""Size of patches of repetitive texture, in metres."""
 WRONG_FROM_M = 4.0
-"""Depth from which repetitive texture misleads fully, less before in proportion: it does further away (Chien 2020,
-2.2.4.1)."""
+"""Depth from which repetitive texture has its full effect, proportional below (Chien 2020, 2.2.4.1: farther away it
+misleads)."""
 KINECT_TOTAL_PX = 0.067
-"""Noise of a Kinect's disparity in pixels, with that of its steps."""
+"""Noise of a Kinect's disparity in pixels, including its steps."""
 HOLE_LASTS = 0.5
-"""Share of what makes a hole that stays with the place on the surface; the rest is new in each frame."""
+"""Share of the cause of a hole that is fixed to the surface; the rest is new in each frame."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +49,18 @@ class RealisticDepthCamera(D435):
     """A depth camera with the errors of a real one. Lengths in pixels are those of its own image.
 
     subpixel: standard deviation of the disparity before it is rounded to steps.
-    step: the disparity comes in whole steps of so many pixels.
-    correlation_px: standard deviation of the Gaussian by which the noise is smoothed (its size stays): the correlation
+    step: size of the disparity's discrete steps in pixels.
+    correlation_px: standard deviation of the Gaussian that smooths the noise at constant size: the correlation
         falls to 1/e at twice that.
-    of_surface, of_pixel: shares of its variance that stay with the place on the surface, and with the pixel as long as
+    of_surface, of_pixel: shares of its variance that are fixed to the surface, and to the pixel as long as
         the depth there stays the same; the rest is new in each frame.
-    edge_px: within so many pixels of a step in depth a pixel is lost (share `edge_loss`) or measures something
-        between (share `flying`).
-    holes: share of pixels without value anywhere; with it come `holes_far` at `farthest`, less before as the square of
-        the depth, `holes_steep` where surfaces are seen from the side, `holes_dark` where they are black.
+    edge_px: within this many pixels of a step in depth a pixel is lost (share `edge_loss`) or measures a value
+        in between (share `flying`).
+    holes: share of invalid pixels anywhere; in addition `holes_far` at `farthest`, falling with the square of
+        the depth, `holes_steep` on surfaces seen at a grazing angle, `holes_dark` on black ones.
     hole_px: standard deviation of the Gaussian that makes holes patchy.
-    repetitive: share of the surfaces whose texture repeats each `period` metres; `mismatched`: share of their far
-        pixels whose disparity is too large by that period: they seem too near.
+    repetitive: share of the surfaces whose texture repeats every `period` metres; `mismatched`: share of their far
+        pixels whose disparity is too large by that period: they appear too near.
     """
 
     edge_loss: float = 0.25
@@ -80,11 +81,12 @@ class RealisticDepthCamera(D435):
     def measure(
         self, true_depth_m: NDArray[np.floating], seed: int | list[int], T_world_camera: Transform | None = None
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Return depth in whole millimetres, 0 if there is none, and the reason: UNKNOWN, it does not say why.
+        """Return depth in whole millimetres, 0 if there is none, and the reason, which is always UNKNOWN for invalid
+        pixels.
 
-        true_depth_m: (height, width) along the optical axis, inf if there is nothing. seed: the first number is that
-        of what stays with surfaces and pixels, all of them that of the rest. T_world_camera: (4, 4), where the camera
-        stands.
+        true_depth_m: (height, width) along the optical axis, inf if there is nothing. seed: its first number is for
+        errors fixed to surfaces and pixels, all of them for the rest. T_world_camera: (4, 4), the camera's
+        pose.
         """
         first = seed if isinstance(seed, int) else seed[0]
         there = _Places.of(self, np.asarray(true_depth_m, np.float32), T_world_camera, first)
@@ -119,7 +121,7 @@ class RealisticDepthCamera(D435):
         return np.where(wrong, true + np.float32(self.period * self.camera.fx) / there.depth, true)
 
     def _at_edges(self, disparity: Image, true: Image, random: np.random.Generator) -> tuple[Image, NDArray[np.bool_]]:
-        """Return the disparity with flying pixels between fore- and background, and what is lost next to edges."""
+        """Return the disparity with flying pixels between fore- and background, and the pixels lost next to edges."""
         import cv2
 
         near, far = extreme(np.maximum, true, self.edge_px), extreme(np.minimum, true, self.edge_px)
@@ -131,7 +133,7 @@ class RealisticDepthCamera(D435):
         return np.where(flying, between, disparity), edge & (chance < _below(self.edge_loss))
 
     def _holes(self, there: _Places, random: np.random.Generator) -> NDArray[np.bool_]:
-        """Return which pixels of flat surfaces have no value."""
+        """Return the pixels of flat surfaces without a value."""
         share = np.float32(self.holes) + np.float32(self.holes_far) * (there.depth / np.float32(self.farthest)) ** 2
         share += np.float32(self.holes_steep) * np.maximum(1 - there.cosine() / np.float32(STEEP), 0)
         share += np.float32(self.holes_dark) * np.maximum(1 - there.grey() / np.float32(DARK_GREY), 0)
@@ -141,14 +143,14 @@ class RealisticDepthCamera(D435):
 
 
 def honest_d435(own: D435) -> RealisticDepthCamera:
-    """Return a camera of the same size and limits that errs as the RealSense D400 family does."""
+    """Return a camera of the same size and limits with the errors of the RealSense D400 family."""
     return RealisticDepthCamera(own.camera, nearest=own.nearest, farthest=own.farthest)
 
 
 def honest_kinect(width: int = WIDTH) -> RealisticDepthCamera:
-    """Return a Kinect of the first kind, whose image is `width` pixels wide: a picture of the full one.
+    """Return a first-generation Kinect, whose image is `width` pixels wide: a scaled copy of the full one.
 
-    Khoshelham and Elberink (2012): steps of 1/8 pixel; it sees from 0.5 m on.
+    Khoshelham and Elberink (2012): steps of 1/8 pixel; its minimum range is 0.5 m.
     """
     size = width / WIDTH
     return RealisticDepthCamera(
@@ -161,9 +163,9 @@ def honest_kinect(width: int = WIDTH) -> RealisticDepthCamera:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where on surfaces the pixels of an image look.
+    """The points on surfaces that the pixels of an image see.
 
-    depth: (height, width) float32 metres, if nothing is that of the farthest thing a camera could see. points:
+    depth: (height, width) float32 metres; missing values are the farthest a camera could see. points:
     (height * width, 3) float32 in the world, metres. x, y: slopes of the rays. fx, fy: focal lengths in pixels.
     """
 
@@ -185,13 +187,13 @@ class _Places:
         return cls(depth, points, x, y, device.camera.fx, device.camera.fy, seed % 2**31)
 
     def at_metres(self, metres: float, number: int) -> Image:
-        """Return noise of variance 1 that stays with surfaces and is alike over so many metres; one field a number."""
+        """Return noise of variance 1, fixed to surfaces and correlated over this many metres; one field per number."""
         return self._even(self.points / np.float32(metres), number)
 
     def at_surface(self, pixels: float, number: int) -> Image:
-        """Return noise of variance 1 that stays with surfaces and is alike over about so many pixels.
+        """Return noise of variance 1, fixed to surfaces and correlated over about this many pixels.
 
-        As texture does it changes with the size in which it is seen: of the two scales next to that of the pixel each
+        Like texture it changes with the apparent size: each of the two scales next to the pixel's
         has its own.
         """
         wanted = np.log2(self.depth * np.float32(ALIKE * max(pixels, 0.2) / self.fx))
@@ -209,7 +211,7 @@ class _Places:
         return noise
 
     def at_pixel(self, pixels: float, disparity: Image) -> Image:
-        """Return noise of variance 1 that stays with pixels, as long as their disparity stays about the same."""
+        """Return noise of variance 1 that is fixed to pixels, as long as their disparity stays about the same."""
         height, width = disparity.shape
         cell = np.float32(ALIKE * max(pixels, 0.2))
         v, u = np.mgrid[:height, :width].astype(np.float32) / cell
@@ -237,7 +239,7 @@ class _Places:
 
 
 def _below(share: Image | float) -> Image:
-    """Return below which number a normal variable lies with this probability."""
+    """Return the bound that a normal variable stays below with this probability."""
     from scipy.special import ndtri
 
     return ndtri(np.clip(np.asarray(share, np.float32), np.float32(1e-7), np.float32(1 - 1e-7)))

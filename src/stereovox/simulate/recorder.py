@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write what a simulated D435 and a simulated T265 on one mount record, as a folder that `open_source` reads."""
+"""Record a simulated D435 and a simulated T265 on one mount, as a folder that `open_source` reads."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TRACKER = "tracker.txt"
 START_NS = 1_000_000_000_000
 """Time of the first image on the camera's clock."""
 LEAD_NS = 500_000_000
-"""The tracker reports this much earlier than the first image and later than the last one."""
+"""The tracker starts this much before the first image and ends this much after the last one."""
 MOUNT = np.eye(4)
-"""T_tracker_camera of a usual mount, both in optical axes: the D435 3 cm below the T265, a degree or so out of line."""
+"""T_tracker_camera of a usual mount, both in optical axes: the D435 3 cm below the T265, about a degree misaligned."""
 MOUNT[:3, :3] = rotation_matrix([0.022, -0.015, 0.009])
 MOUNT[:3, 3] = 0.0125, 0.0318, -0.0041
 MOUNT.setflags(write=False)
@@ -35,9 +35,9 @@ MOUNT.setflags(write=False)
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What was recorded, and the truth about it.
+    """A recording and its ground truth.
 
-    track: what the tracker reported and should have reported.
+    track: the tracker's reported and true poses.
     T_map_world: (4, 4) maps the simulation's z-up world into the map of a pair with `world = "optical"`: x right, y
         down, z forward, origin at the tracker's first pose. `simulation.stage.moved(T_map_world)` is the truth there
         (with `axes=world`).
@@ -59,9 +59,9 @@ def record(
 ) -> Recording:
     """Write depth images, intrinsics, poses and `pair.toml` into the new or empty `folder`.
 
-    T_tracker_camera: the true mount, both bodies in optical axes. calibrated: whether `pair.toml` tells mount and
-    clock; `world`: its key of that name. Depth is written in whole millimetres, 0 for none; the reason of a missing
-    value is lost, as in any file of a D435. Raises SourceError if the folder holds something.
+    T_tracker_camera: the true mount, both bodies in optical axes. calibrated: whether `pair.toml` contains mount and
+    clock; `world`: its key of that name. Depth is written in whole millimetres, 0 for none; reasons are
+    lost, as in any file of a D435. Raises SourceError if the folder is not empty.
     """
     tracker = tracker or T265()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -78,9 +78,9 @@ def record(
 
 
 def follow(simulation: Simulation, tracker: T265, T_tracker_camera: Transform = MOUNT) -> tuple[Track, Transform]:
-    """Return what a tracker on the simulated camera reports, and T_start_world of its world (see `start_frame`).
+    """Return the track of a tracker on the simulated camera, and T_start_world of its world (see `start_frame`).
 
-    Stamps are those of a recording: the first image is taken at `START_NS` on the camera's clock.
+    Stamps are as in a recording: the first image is taken at `START_NS` on the camera's clock.
     """
     last = (len(simulation) - 1) * simulation.period_ns
     times = np.arange(-LEAD_NS, last + LEAD_NS + 1, 1_000_000_000 // RATE_HZ)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of simulated scenes: surfaces with a pattern and light, seen through a lens. For stereo matching."""
+"""Photographs of simulated scenes for stereo matching: surfaces with a pattern and light, seen through a lens."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from stereovox.simulate.scene import Scene
 WAVE, OCTAVES = 0.4, 7
 """Longest wave of the pattern in metres, and how often it is halved: down to 6 mm."""
 CONTRAST = 0.5
-"""How much the pattern changes the brightness of a surface, as a share of it, where nothing else is asked for."""
+"""Default relative change of a surface's brightness by the pattern."""
 LIGHT = np.array([0.36, 0.48, 0.8], np.float32)
-"""Where the light comes from."""
+"""Direction of the light."""
 SKY = 205.0
-"""Grey of what is outside of the scene."""
+"""Grey value outside the scene."""
 STEEPEST = 0.1
-"""Cosine from which on a surface seen from its side is not blurred any more."""
+"""Cosine below which grazing surfaces are not blurred further."""
 
 
 def photograph(
     scene: Scene, lens: Lens, T_world_lens: Transform, noise: float, seed: list[int], contrast: float = CONTRAST
 ) -> NDArray[np.uint8]:
-    """Return the grey image (height, width) uint8 that a lens takes of a scene; black where the lens sees nothing.
+    """Return the grey image (height, width) uint8 of a scene through a lens; black outside the lens's view.
 
     T_world_lens: (4, 4) of its optical frame. noise: standard deviation in grey levels; same seed, same image.
-    contrast: how much the pattern changes the brightness of a surface, as a share of it.
-    The pattern is fixed to the surfaces: two lenses see the same one. It is blurred as pixels blur it.
+    contrast: relative change of a surface's brightness by the pattern.
+    The pattern is fixed to the surfaces, so two lenses see the same one. It is blurred as by pixels.
     """
     rays = _rays(lens)
     seen = np.isfinite(rays[:, 2])
@@ -53,7 +53,7 @@ def _rays(lens: Lens) -> NDArray[np.float32]:
 def _shade(
     scene: Scene, eye: NDArray[np.float32], directions: NDArray[np.float32], pixel: float, contrast: float
 ) -> NDArray[np.float32]:
-    """Return the grey (N,) float32 of what unit directions (N, 3) from `eye` meet; pixel: its width in radians."""
+    """Return the grey (N,) float32 at the hits of unit directions (N, 3) from `eye`; pixel: its width in radians."""
     distance, normals, triangles = scene.hits(eye, directions)
     there = triangles >= 0
     grey = np.full(len(directions), SKY, np.float32)

@@ -35,7 +35,7 @@ class Solid:
 
     @cached_property
     def planes(self) -> NDArray[np.float64]:
-        """Outward unit normals and offsets (M, 4): a point x is in the solid where `n . x <= d` for all planes."""
+        """Outward unit normals and offsets (M, 4): a point x is in the solid if `n . x <= d` for all planes."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         normals = np.cross(b - a, c - a)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -43,10 +43,10 @@ class Solid:
         return np.unique(planes.round(9), axis=0)
 
     def contains(self, points: ArrayLike, margin: float = 1e-6) -> NDArray[np.bool_]:
-        """Return which points (N, 3) lie in the solid; points up to `margin` metres outside count as in it."""
+        """Return which points (N, 3) are in the solid; points up to `margin` metres outside count as inside."""
         points = np.asarray(points, float)
         left = np.arange(len(points))
-        for *normal, offset in self.planes:  # most points are soon told to be outside
+        for *normal, offset in self.planes:  # most points are soon found to be outside
             left = left[points[left] @ normal <= offset + margin]
         inside = np.zeros(len(points), bool)
         inside[left] = True
@@ -69,16 +69,16 @@ class Scene:
         return [solid for solid in self.solids if solid.part == name]
 
     def cast(self, origin: ArrayLike, directions: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return how often `directions` (N, 3) fits between `origin` (3,) and the first surface, inf without any.
+        """Return the distance from `origin` (3,) to the first surface in units of `directions` (N, 3), inf without any.
 
-        With directions whose component along the optical axis is 1 this is the depth. float32, releases the GIL.
+        For directions whose component along the optical axis is 1 this is the depth. float32, releases the GIL.
         """
         return self._tree.nearest(np.array(origin, np.float64), np.asarray(directions, np.float32))[0]
 
     def hits(
         self, origin: ArrayLike, directions: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-        """Return what `cast` does, the unit normals (N, 3) of the surfaces met, and their triangles (N,), -1: none.
+        """Return the result of `cast`, the unit normals (N, 3) of the surfaces, and their triangles (N,), -1: none.
 
         Normals are outward, 0 if there is none.
         """
@@ -99,7 +99,7 @@ class Scene:
 def box(
     part: str, name: str, low: Point, high: Point, turn: float = 0.0, about: tuple[float, float] | None = None
 ) -> Solid:
-    """Return a box between two corners, turned by `turn` radians round the vertical through `about` (its middle)."""
+    """Return a box between two corners, turned by `turn` radians round the vertical through `about` (its centre)."""
     import trimesh
 
     low_, high_ = np.asarray(low, float), np.asarray(high, float)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that need no files: a simulated depth camera in a built-in scene."""
+"""Recordings without files: a simulated depth camera in a built-in scene."""
 
 from __future__ import annotations
 
@@ -44,26 +44,26 @@ AXES = ("world", "optical")
 SIMPLE = "simple"
 CAMERAS = (SIMPLE, "d435", "kinect")
 GREY_NOISE = 1.5
-"""Of photographs, in grey levels."""
+"""Noise of photographs, in grey levels."""
 OWN = -1.0
-"""Stands for what the camera has by itself."""
+"""Marks the camera's own value."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Parameters of every simulation. Where 0 stands for "the scene's own", the scene chooses.
+    """Parameters of every simulation. A 0 that means "the scene's own" leaves the choice to the scene.
 
     axes: `world` (z up) or `optical` (Chien 2020: x right, y down, z forward, origin at the first camera).
-    frames: number of frames on the same way (0: the scene's own); noise: see `Simulation`; seed: of the noise.
-    camera: `simple` (noise independent from pixel to pixel, true reasons for missing values), or one that errs as real
-        ones do: `d435`, `kinect`; see `stereovox.simulate.honest`.
-    image_width: pixels (0: the scene's own, mostly 848; of a Kinect 640), the height follows; the field of view stays.
+    frames: number of frames on the same path (0: the scene's own); noise: see `Simulation`; seed: of the noise.
+    camera: `simple` (noise independent from pixel to pixel, true reasons for invalid pixels), or one with realistic
+        errors: `d435`, `kinect`; see `stereovox.simulate.honest`.
+    image_width: pixels (0: the scene's own, mostly 848; of a Kinect 640); the height follows, the field of view stays.
     barrel, toe_in (degrees), farthest (metres, 0: the scene's own): see `D435`.
     subpixel, correlation: size of the noise, and the Gaussian that smooths it, in pixels (-1: the camera's own).
-    photo: contrast of the pattern on all surfaces in a grey image that is taken along, registered to the depth (0.5:
-        much of it, 0.05: painted walls; 0: no image is taken).
-    drift: how much the poses err, in metres per metre travelled (0.01 is a good tracker's), in all directions; the
-        heading drifts along, roll and pitch stay right, and no place is found again. Images are of the true poses.
+    photo: contrast of the pattern on all surfaces in a grey image taken with the depth and registered to it (0.5:
+        strong, 0.05: painted walls; 0: no image).
+    drift: error of the poses, in metres per metre travelled (0.01 is a good tracker's), in all directions; the
+        heading drifts too, roll and pitch stay right, and no place is recognised. Images show the true poses.
     """
 
     axes: str = "world"
@@ -113,13 +113,13 @@ class Simulation(DepthSource):
         sim:offices?offices=8&visits=10&walk=0      a corridor with offices of one kind, some visited again
         sim:hall?plan=0                             a hall at random, with pillars, posts, boxes and lamps
 
-    The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
-    left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
-    itself and is always the same for the same `seed`.
+    See the scene functions for their parameters, and `Options` for those of every scene. World: z up, x forward, y
+    left, metres; with `axes=optical` x right, y down, z forward from the first camera. Frames can be read in any order
+    and are always the same for the same `seed`.
     Reasons of the `simple` camera are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be
-    free no farther), UNMATCHED next to edges and where the right eye sees nothing. The others do not say why.
-    noise: False gives exact depth in metres (float32, inf if nothing is) without noise or holes.
-    frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
+    free no farther), UNMATCHED next to edges and where the right eye sees nothing. The others have no reasons.
+    noise: False gives exact depth in metres (float32, inf if there is nothing) without noise or holes.
+    frames: number of frames on the whole path; None: the scene's own. The duration of the path does not change.
     Raises SourceError for an unknown scene or parameter and for values out of range.
     """
 
@@ -150,17 +150,17 @@ class Simulation(DepthSource):
 
     @cached_property
     def stage(self) -> Stage:
-        """The scene and the way through it, in the frame of the poses."""
+        """The scene and the path through it, in the frame of the poses."""
         return self._in_frame(self._world)
 
     @property
     def scene(self) -> Scene:
-        """What the camera flies through, in the frame of the poses."""
+        """The solids around the camera, in the frame of the poses."""
         return self.stage.scene
 
     @property
     def faces(self) -> tuple[Face, ...]:
-        """Flat surfaces by which a map can be judged, in the frame of the poses; empty for `sim:room`."""
+        """Flat surfaces for evaluating a map, in the frame of the poses; empty for `sim:room`."""
         return self.stage.faces
 
     def __len__(self) -> int:
@@ -172,15 +172,16 @@ class Simulation(DepthSource):
         return self.observe(i, self.true_depth(i))
 
     def true_depth(self, i: int) -> NDArray[np.float32]:
-        """Return the exact depth (height, width) in metres along the optical axis, inf if nothing is; read only."""
+        """Return the exact depth (height, width) in metres along the optical axis, inf if there is nothing;
+        read-only."""
         T = self._world.path(self._share(i))  # the frame of the poses must not change the image
         seen = self._seen
         if seen is None or not np.array_equal(seen[0], T):
-            seen = self._seen = (T, self._cast(T))  # a camera that stands looks once
+            seen = self._seen = (T, self._cast(T))  # cache for a static camera
         return seen[1]
 
     def observe(self, i: int, true_depth_m: NDArray[np.float32]) -> Frame:
-        """Return what the camera delivers as frame `i` where `true_depth_m` is the exact depth (height, width)."""
+        """Return the camera's frame `i` for the exact depth `true_depth_m` (height, width)."""
         T_world_camera = self._world.path(self._share(i))
         name = f"{self.name} frame {i}"
         return self._taken(true_depth_m, i, T_world_camera, self.pose(i), i * self.period_ns, name, self._photo(i))
@@ -188,10 +189,11 @@ class Simulation(DepthSource):
     def frame_from(
         self, T_world_camera: Transform, number: int, stamp_ns: int, T_reported: Transform | None = None
     ) -> Frame:
-        """Return what the camera delivers anywhere off its way, world z up.
+        """Return the camera's frame from any pose off its path, world z up.
 
-        T_world_camera: (4, 4), where it is. number: another one has other noise. T_reported: the pose that the frame
-        comes with; None: the true one.
+        T_world_camera: (4, 4), the true pose. number: different numbers give different noise. T_reported: the pose of
+        the
+        frame; None: the true one.
         """
         reported = T_world_camera if T_reported is None else T_reported
         depth_m = self._cast(T_world_camera)
@@ -219,7 +221,7 @@ class Simulation(DepthSource):
         )
 
     def _photo(self, i: int) -> Photo | None:
-        """Return the grey image of frame `i`, taken once it is needed; None if none is asked for."""
+        """Return the grey image of frame `i`, rendered when it is needed; None if `photo` is 0."""
         if not self.options.photo:
             return None
         camera = self.camera
@@ -229,7 +231,7 @@ class Simulation(DepthSource):
         return Photo(lambda: photograph(self._world.scene, lens, T, GREY_NOISE, seed, contrast), camera)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) that frame `i` comes with, drifted; raises IndexError beyond the last."""
+        """Return T_world_camera (4, 4) as reported with frame `i`, drifted; raises IndexError beyond the last."""
         self._check(i)
         return self._reported(self._share(i))
 
@@ -239,20 +241,20 @@ class Simulation(DepthSource):
         return self.stage.path(self._share(i))
 
     def upright_pose_at(self, stamp_ns: float) -> Transform:
-        """Return the true T_world_camera (4, 4) at any time, world z up whatever `axes` says.
+        """Return the true T_world_camera (4, 4) at any time, world z up whatever `axes` is.
 
-        The camera stands before the first frame and after the last.
+        The camera is static before the first frame and after the last.
         """
         last = max(len(self) - 1, 1) * self.period_ns
         return self._world.path(min(max(stamp_ns / last, 0.0), 1.0))
 
     @cached_property
     def _reported(self) -> CameraPath:
-        """The poses as frames have them."""
+        """The poses as reported in frames."""
         if not self.options.drift:
             return self.stage.path
         seconds = (self._world.frames - 1) / self._world.hz
-        random = np.random.default_rng([self.seed, 0, 2])  # not the noise's
+        random = np.random.default_rng([self.seed, 0, 2])  # separate from the noise
         return self._in_frame(
             replace(self._world, path=drifting(self._world.path, seconds, self.options.drift, random))
         ).path
@@ -282,7 +284,7 @@ class Simulation(DepthSource):
 
 
 def _read(text: str, texts: dict[str, Any]) -> tuple[Options, Stage]:
-    """Return what a location without its `sim:` asks for; `texts` counts where it says nothing."""
+    """Return the options and the stage of a location without its `sim:`; `texts` holds defaults."""
     name, written = parameters.split(text)
     build = registry.find("scenes", SCENES, name)
     own, common = parameters.defaults(build), parameters.defaults(Options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stage of a simulation: a scene, the camera and its path, and the planes by which a map is judged."""
+"""The stage of a simulation: a scene, the camera and its path, and the planes for evaluating a map."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereovox.simulate.d435 import D435
 from stereovox.simulate.scene import Point, Scene, Solid
 
 SHIFT = np.array([0.0137, 0.0219, -0.0123])
-"""Metres by which plans are moved, so that no wall lies exactly on a cell's face for any round cell size."""
+"""Offset of plans in metres, so that no wall is exactly on a cell's face for any round cell size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ def rectangle(name: str, low: Point, high: Point, towards: Point) -> Face:
 class Stage:
     """A scene and a camera that moves through it. World: z up, metres.
 
-    build: makes the scene; called once, when it is needed. path: T_world_camera (4, 4) at a share of the path, 0
+    build: makes the scene; called once, when needed. path: T_world_camera (4, 4) at a share of the path, 0
     (start) to 1 (end). frames, hz: number of images on the path, and images a second. faces: flat surfaces of the scene
-    by which a map can be judged.
+    for evaluating a map.
     """
 
     build: Callable[[], Scene]
@@ -66,7 +66,7 @@ class Stage:
 
     @cached_property
     def scene(self) -> Scene:
-        """What the camera sees."""
+        """The camera's surroundings."""
         return self.build()
 
     def moved(self, T_new_world: Transform) -> Stage:
@@ -93,7 +93,7 @@ def moved(scene: Scene, T_new_world: Transform) -> Scene:
 def within(name: str, value: float, low: float, high: float) -> None:
     """Raise SourceError if a parameter leaves its limits."""
     if not low <= value <= high:
-        raise SourceError(f"{name}={value:g} must lie between {low:g} and {high:g}")
+        raise SourceError(f"{name}={value:g} must be between {low:g} and {high:g}")
 
 
 def one_of(name: str, value: str, known: tuple[str, ...]) -> None:

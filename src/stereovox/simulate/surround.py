@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:surround`: a drone with four stereo cameras in the furnished room, which takes real photographs of it."""
+"""`sim:surround`: a drone with four stereo cameras in the furnished room, with rendered photographs."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from stereovox.sources.base import Source
 
 BASELINE = 0.15
 TOE_IN_DEG, ROLL_DEG = 0.4, -0.3
-"""How the right eye of each pair is turned against the left: nobody glues cameras straight."""
+"""Rotation of the right eye of each pair relative to the left: real mounts are never perfectly aligned."""
 FISHEYE_DEG = (150.0, 140.0)
-"""Width and height of the fisheyes' virtual images. In their corners rows lie so steeply; further aside than 75 degrees
+"""Width and height of the fisheyes' virtual images, limited by the steep rows in their corners; beyond 75 degrees aside
 a pair sees along its own baseline, and its ranges are four times as noisy as in the middle (Valenti 2018, Eq 4.7)."""
 BACKWARD_DEG = 20.0
-"""The side cameras are turned so far backward, so that behind the vehicle both see something."""
+"""Backward rotation of the side cameras, so that their views overlap behind the vehicle."""
 _FISHEYE = ("fisheye", 175.0, 640, 360, (-0.01, 0.002, 0.0, 0.0))
 HZ = 10.0
 ALL = "all"
@@ -41,9 +41,10 @@ ALL = "all"
 class Surround(Source):
     """Stereo frames of a simulated drone: front, left, right, down at the same moment, then the next moment.
 
-    location: `sim:surround` or with parameters `sim:surround?pair=front&scale=0.5`, see `Options`. The images are as
-    the lenses make them. World: z up, metres; the drone's body is level, x forward, y left, z up. Every frame can be
-    asked for by itself and is always the same for the same `seed`.
+    location: `sim:surround` or with parameters `sim:surround?pair=front&scale=0.5`, see `Options`. The images are
+    raw, with the lenses' distortion. World: z up, metres; the drone's body is level, x forward, y left, z up. Frames
+    can
+    be read in any order and are always the same for the same `seed`.
     Raises SourceError for an unknown parameter and for values out of range.
     """
 
@@ -67,7 +68,7 @@ class Surround(Source):
 
     @cached_property
     def scene(self) -> Scene:
-        """What the drone flies through, in the frame of the world."""
+        """The drone's surroundings, in the frame of the world."""
         return self._stage.scene
 
     def __len__(self) -> int:
@@ -84,9 +85,9 @@ class Surround(Source):
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, name, sensor=pair.name)
 
     def exact(self, i: int) -> Frame:
-        """Return the true depth of what the pair of frame `i` sees, as its rectified left eye has it.
+        """Return the true depth of frame `i` in its pair's rectified left eye.
 
-        Pixels that one of both lenses does not see are MASKED. Nothing there: TOO_FAR.
+        Pixels outside the view of either lens are MASKED. Empty pixels are TOO_FAR.
         """
         pair, T_world_left, stamp_ns, name = self._at(i)
         depth = self._cast(pair, T_world_left)
@@ -125,8 +126,8 @@ class Surround(Source):
 class Options:
     """Parameters of `sim:surround`.
 
-    pair: `all`, or one of `front`, `left`, `right`, `down`. moments: how often all pairs take an image on the way
-    through room and corridor, ten times a second. scale: size of the images, 1: half of Valenti 2018, Table 3.1; 2 as
+    pair: `all`, or one of `front`, `left`, `right`, `down`. moments: number of images of each pair on the path
+    through room and corridor, ten times a second. scale: size of the images, 1: half of Valenti 2018, Table 3.1; 2: as
     there. noise: of the images, grey levels. seed: of the noise.
     """
 
@@ -148,8 +149,8 @@ class Options:
 class Mount:
     """A camera of Table 3.1, at half its resolution.
 
-    hfov_deg, width, height: of the image. distortion: of both lenses. looks_to, down: unit vectors in the body's frame
-    (x forward, y left, z up): optical axis, and what is down in the image. centre: between both eyes, metres.
+    hfov_deg, width, height: of the image. distortion: of both lenses. forward, down: unit vectors in the body's frame
+    (x forward, y left, z up): optical axis, and the image's down direction. centre: between both eyes, metres.
     """
 
     model: str
@@ -173,11 +174,11 @@ MOUNTS = {
     "right": Mount(*_FISHEYE, _aside(-1), (0, 0, -1), (0, -0.12, 0)),
     "down": Mount("pinhole", 105.0, 640, 360, (-0.03, 0.006), (0, 0, -1), (-1, 0, 0), (0, 0, -0.08)),
 }
-"""The four pairs by name, in the order in which they deliver."""
+"""The four pairs by name, in order of delivery."""
 
 
 def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
-    """Return the stereo pair of this name; its images are `scale` times as wide as half those of Table 3.1."""
+    """Return the stereo pair of this name; its images are `scale` times half the width in Table 3.1."""
     mount = MOUNTS[name]
     width, height = max(16, round(mount.width * scale)), max(9, round(mount.height * scale))
     lens = Lens.from_field_of_view(mount.model, width, height, mount.hfov_deg)
@@ -188,7 +189,7 @@ def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
 
 @lru_cache(maxsize=8)
 def visible_to_both(pair: StereoPair) -> NDArray[np.bool_]:
-    """Return which pixels (height, width) of the rectified left image look where both lenses see, far away."""
+    """Return the pixels (height, width) of the rectified left image that both lenses see, for distant objects."""
     assert pair.eyes is not None
     R_left, R_right = pair.eyes.rectifying_rotations()
     rays = _rays(pair).astype(float)
@@ -207,7 +208,7 @@ def _virtual(mount: Mount, width: int, height: int) -> PinholeCamera | Spherical
 
 
 def _right_eye() -> Transform:
-    """Return T_left_right. Toe-in and roll leave the rectified left frame where the left eye's is."""
+    """Return T_left_right. Toe-in and roll leave the rectified left frame equal to the left eye's."""
     T_left_right = np.eye(4)
     turn, roll = rotation_matrix([0, math.radians(TOE_IN_DEG), 0]), rotation_matrix([0, 0, math.radians(ROLL_DEG)])
     T_left_right[:3, :3], T_left_right[0, 3] = turn @ roll, BASELINE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor model of a RealSense T265: jitter, drift, re-localisation, confidence, and a clock of its own.
+"""Sensor model of a RealSense T265: jitter, drift, re-localisation, confidence, and its own clock.
 
 The tracker's file and body have OpenGL axes: x right, y up, z backward. Its world starts at its first pose, with y
 against gravity and z against its first heading (Chien 2020, 4.1 and Fig 4.1).
@@ -24,12 +24,12 @@ WALK_M = 5.0
 """Metres over which the drift keeps its direction: over shorter distances it grows linearly, then with the square root.
 """
 ALIKE = 0.5
-"""Largest change of heading, as a cosine (60 degrees), at which a place is recognised."""
+"""Largest difference of headings, as a cosine (60 degrees), at which a place is recognised."""
 SPACING_M = 0.3
 """Metres between remembered places."""
 RATE_HZ = 200
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""T_opengl_optical: turns optical axes (x right, y down, z forward) into OpenGL ones; it is its own inverse."""
+"""T_opengl_optical: turns optical axes (x right, y down, z forward) into OpenGL ones; its own inverse."""
 FAILED, LOW, MEDIUM, HIGH = range(4)
 """Confidence of a pose."""
 
@@ -54,16 +54,16 @@ class Drift:
 
 @dataclass(frozen=True)
 class T265:
-    """A model of the tracker. All its noise follows from `seed`.
+    """A model of the tracker. `seed` determines all its noise.
 
-    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: its correlation time. drift: how it
-    drifts and recognises places; see `Drift`. settle_s: for this long the confidence is low and the jitter five times
+    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: its correlation time. drift: drift
+    and recognition of places; see `Drift`. settle_s: for this long the confidence is low and the jitter five times
     larger, unless the camera has moved 0.3 m before; Chien 2020, 2.2.3: "low at the beginning and improves as the
     camera starts moving".
     clock_offset_s, clock_drift_ppm: camera time = tracker time + clock_offset_s, at the first pose; from then on the
     tracker's clock gains this many millionths.
     jump_s, jump_m: at this time (None: never) the position jumps sideways by this many metres, until it recognises a
-    place. lost_s: from and to which time (None: never) the confidence is low and the jitter twenty times larger. Times
+    place. lost_s: start and end (None: never) of low confidence and twenty times larger jitter. Times
     count from the first pose.
     """
 
@@ -80,7 +80,7 @@ class T265:
     lost_s: tuple[float, float] | None = None
 
     def track(self, stamps_ns: NDArray[np.int64], T_world_tracker: NDArray[np.float64]) -> Track:
-        """Return what the tracker reports of its true poses.
+        """Return the tracker's report for its true poses.
 
         stamps_ns: (N,) ascending, on the camera's clock, usually 5 ms apart. T_world_tracker: (N, 4, 4) of the body in
         optical axes, world z up. Raises StereovoxError for fewer than two poses and stamps that do not ascend.
@@ -100,7 +100,7 @@ class T265:
         return stamps_ns - round(self.clock_offset_s * 1e9) + gained
 
     def _jumps(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much (N,) metres the position jumps at each pose."""
+        """Return the jump (N,) of the position in metres at each pose."""
         jumps = np.zeros(len(seconds))
         if self.jump_s is not None and self.jump_s <= seconds[-1]:
             jumps[np.searchsorted(seconds, self.jump_s)] = self.jump_m
@@ -115,7 +115,7 @@ class T265:
         return confidence
 
     def _unrest(self, seconds: NDArray[np.float64], confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return how many times (N,) larger than usual the jitter is."""
+        """Return the factor (N,) on the jitter."""
         unrest = np.where(confidence < HIGH, 5.0, 1.0)
         if self.lost_s is not None:
             unrest[(seconds >= self.lost_s[0]) & (seconds < self.lost_s[1])] = 20.0
@@ -141,7 +141,7 @@ class T265:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What a tracker reported, and what it should have reported.
+    """The reported and the true poses of a tracker.
 
     stamps_ns: (N,) int64, the tracker's own clock. positions: (N, 3) metres. quaternions: (N, 4) x, y, z, w.
     confidence: (N,) uint8, 0 (failed) to 3 (high). All in OpenGL axes, tracker to the tracker's world.
@@ -156,7 +156,7 @@ class Track:
 
     @cached_property
     def errors_m(self) -> NDArray[np.float64]:
-        """How far (N,) each position is from the true one, in metres."""
+        """Distance (N,) of each position from the true one, in metres."""
         return np.linalg.norm(self.positions - self.truth[:, :3, 3], axis=1)
 
 
@@ -174,7 +174,7 @@ def drifted(
     steps = np.unique(np.append(np.arange(0, len(seconds), _stride(seconds)), len(seconds) - 1))
     coarse = _walk(drift, seconds[steps], poses[steps], _sudden(jumps_m, steps), random)
     fine = np.stack([np.interp(seconds, seconds[steps], column) for column in coarse.T], axis=1)
-    for k in np.flatnonzero(jumps_m):  # interpolation would make a ramp of it
+    for k in np.flatnonzero(jumps_m):  # interpolation would turn it into a ramp
         after = int(np.searchsorted(steps, k))
         between = np.arange(steps[max(after - 1, 0)], steps[after])
         fine[between] = np.where((between < k)[:, None], coarse[max(after - 1, 0)], coarse[after])
@@ -182,13 +182,13 @@ def drifted(
 
 
 def start_frame(T_world_first: Transform) -> Transform:
-    """Return T_start_world (4, 4): the world that the tracker derives from its first pose, in OpenGL axes.
+    """Return T_start_world (4, 4): the tracker's world, derived from its first pose, in OpenGL axes.
 
     T_world_first: body in optical axes, world z up. Raises StereovoxError if it has no heading.
     """
     ahead = T_world_first[:3, 2] * [1, 1, 0]
     if np.linalg.norm(ahead) < 1e-6:
-        raise StereovoxError("a tracker that starts by looking straight up or down has no heading; start it level")
+        raise StereovoxError("a tracker that starts pointing straight up or down has no heading; start it level")
     back, up = -ahead / np.linalg.norm(ahead), np.array([0.0, 0, 1])
     T_world_start = np.eye(4)
     T_world_start[:3, :3] = np.column_stack([np.cross(up, back), up, back])
@@ -223,7 +223,7 @@ class _Places:
             self.error.append(error)
 
     def find(self, T: NDArray[np.float64], way: float, drift: Drift) -> NDArray[np.float64] | None:
-        """Return the errors at the earliest place known again, else None."""
+        """Return the errors at the earliest recognised place, else None."""
         old = int(np.searchsorted(self.way, way - drift.loop_m)) if drift.find_again_m else 0
         if not old:
             return None
@@ -279,7 +279,7 @@ def _step(
     course: NDArray[np.float64],
     random: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Return what one step adds to the errors (4,): a wrong heading also sends the position astray."""
+    """Return the errors (4,) added by one step: a wrong heading also displaces the position."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
     astray = [(cosine - 1) * move[0] + sine * move[2], 0.0, (cosine - 1) * move[2] - sine * move[0]]
     turn = np.radians(drift.yaw_deg) * np.sqrt(length) * random.standard_normal()
@@ -287,7 +287,7 @@ def _step(
 
 
 def _alike(white: NDArray[np.float64], steps: float) -> NDArray[np.float64]:
-    """Return noise (N, K) of the same variance, correlated over so many steps (first-order low pass)."""
+    """Return noise (N, K) of the same variance, correlated over this many steps (first-order low pass)."""
     from scipy.signal import lfilter
 
     keep = np.exp(-1 / steps) if steps > 0 else 0.0

@@ -11,14 +11,14 @@ from stereovox.simulate import _rays
 LEAF = 4
 """Most triangles of a leaf."""
 MAX_LEVELS = 64
-"""Boxes that wait while rays go down one side of the tree: no more than it has levels."""
+"""Most boxes that wait while rays descend one side of the tree: one per level."""
 
 
 class TriangleTree:
     """Triangles (M, 3, 3) float64 in metres, at least one and all finite, sorted into a balanced tree.
 
-    On each level a box's triangles are split into two halves of equal number along the axis that makes the halves'
-    surfaces smallest (Goldsmith and Salmon 1987): rays meet a box as often as its surface is large.
+    On each level a box's triangles are split into two halves of equal number along the axis that minimises the
+    halves' surfaces (Goldsmith and Salmon 1987), since rays meet a box in proportion to its surface.
     """
 
     def __init__(self, triangles: NDArray[np.float64]):
@@ -32,7 +32,7 @@ class TriangleTree:
     def nearest(
         self, origin: NDArray[np.float64], directions: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return how often `directions` (N, 3) fits between `origin` (3,) and the first triangle, and which it is.
+        """Return the distance from `origin` (3,) to the first triangle in units of `directions` (N, 3), and its number.
 
         float32, inf if there is none; int32, -1 if there is none. A triangle without area is never met, and a
         ray on the side of two always meets one of them. Releases the GIL.
@@ -56,12 +56,12 @@ class TriangleTree:
 
 
 def _bounds(count: int, level: int) -> NDArray[np.int64]:
-    """Return where the 2 ** level parts of `count` sorted triangles begin, and the end."""
+    """Return the starts of the 2 ** level parts of `count` sorted triangles, and the end."""
     return count * np.arange(2**level + 1) >> level
 
 
 def _sorted(low: NDArray[np.float64], high: NDArray[np.float64], levels: int) -> NDArray[np.int32]:
-    """Return the order (M,) in which the triangles of each box lie together, on all levels."""
+    """Return the order (M,) that keeps the triangles of each box together, on all levels."""
     middle = low + high
     order = np.arange(len(low), dtype=np.int32)
     for level in range(levels):
@@ -83,7 +83,8 @@ def _surface(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.
 
 
 def _boxes(low: NDArray[np.float64], high: NDArray[np.float64], starts: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the lowest and highest corner (nodes, 6) of all nodes: 0 is none, 1 all, 2 and 3 its halves, and so on."""
+    """Return the lowest and highest corner (nodes, 6) of all nodes: 0 is unused, 1 all, 2 and 3 its halves, and so
+    on."""
     levels = [(np.minimum.reduceat(low, starts[:-1]), np.maximum.reduceat(high, starts[:-1]))]
     while len(levels[0][0]) > 1:
         low, high = levels[0]

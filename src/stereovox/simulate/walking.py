@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody walks from waypoint to waypoint with a camera in the hand."""
+"""A person walks from waypoint to waypoint with a camera in the hand."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from stereovox.geometry.se3 import Transform, look_at, rotation_matrix
 TURN_DEG = 70.0
 """Degrees a second at which the camera turns."""
 EYE, PITCH_DEG = 1.35, -9.0
-"""Height above the floor in metres; how far the camera looks down, in degrees, once it is on its way."""
+"""Height above the floor in metres; downward pitch of the camera in degrees while walking."""
 
 
 def walk(
     waypoints: NDArray[np.float64], speed: float, turn_deg: float = TURN_DEG
 ) -> tuple[Callable[[float], Transform], float]:
-    """Return the path (T_world_camera at a share of it) and how many seconds it takes at `speed` m/s.
+    """Return the path (T_world_camera at a share of it) and its duration in seconds at `speed` m/s.
 
     waypoints: (N, 3) x and y in metres and yaw in degrees (0: along x, 90: along y; never a jump from 180 to -180).
-    Between two of them the camera walks and turns (`turn_deg` a second) at once, whichever takes longer sets the time,
-    and it never leaves the rectangle between them. Floor at z = 0. The first image looks exactly level.
+    Between two of them the camera walks and turns (`turn_deg` a second) at once; the slower of both sets the time,
+    and it never leaves the rectangle between them. Floor at z = 0. The first image is exactly level.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -47,7 +47,7 @@ def _times(waypoints: NDArray[np.float64], speed: float, turn_deg: float) -> NDA
 
 
 def _held(eye: NDArray[np.float64], yaw: float, seconds: float) -> Transform:
-    """Return T_world_camera as a hand holds it: it bobs with the steps, sways and looks a little down."""
+    """Return T_world_camera of a hand-held camera: it bobs with the steps, sways and tilts slightly down."""
     beat = 2 * np.pi * seconds
     eye = eye + np.array([0, 0, 0.012 * np.sin(1.8 * beat)])
     pitch = np.radians(PITCH_DEG * (1 - np.exp(-seconds)) + 1.5 * np.sin(0.7 * beat))

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that unpacks LZF, in which PCL packs its point clouds (format: LibLZF 3.6, lzf_d.c).
+"""Kernel that unpacks LZF, the compression of PCL's point clouds (format: LibLZF 3.6, lzf_d.c).
 
-By hand, because no dependency unpacks LZF, and this one cannot write past the size it was given.
+Written by hand, because no dependency unpacks LZF, and this one cannot write past the given size.
 """
 
 from stereovox.kernels._jit import kernel
 
 LITERALS = 32
-"""Control bytes below it announce so many bytes and one more; others a piece of what was written before."""
+"""Smaller control bytes announce that many literal bytes plus one; others a copy of earlier output."""
 
 
 @kernel
 def unpack(packed, unpacked):
-    """Fill `unpacked` (n,) uint8 from `packed` (m,) uint8; return how many bytes were written, -1 for damage."""
+    """Fill `unpacked` (n,) uint8 from `packed` (m,) uint8; return the number of bytes written, -1 if damaged."""
     read, written = 0, 0
     while read < packed.size:
         control = packed[read]
@@ -38,7 +38,7 @@ def unpack(packed, unpacked):
             length += 2
             if start < 0 or written + length > unpacked.size:
                 return -1
-            for k in range(length):  # byte by byte: a piece may reach into itself
+            for k in range(length):  # byte by byte, since a copy may overlap its own output
                 unpacked[written + k] = unpacked[start + k]
         written += length
     return written

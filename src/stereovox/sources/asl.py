@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo recordings in the ASL layout: EuRoC's, and those of TUM VI and of the many tools that write it."""
+"""Stereo recordings in the ASL layout of EuRoC, TUM VI and many tools."""
 
 from __future__ import annotations
 
@@ -34,31 +34,31 @@ IMU = "imu0"
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders with poses, the best first: EuRoC's estimate, TUM VI's motion capture, EuRoC's."""
 TEXTS = ("poses.txt", "groundtruth.txt")
-"""Files of poses of the body in TUM format, if there are no such folders."""
+"""Files with poses of the body in TUM format, used if there are no such folders."""
 CHAINS = ("camchain.yaml", "dso/camchain.yaml")
-"""Calibrations of Kalibr that stand in for sensor.yaml; TUM VI has the second."""
+"""Kalibr's calibrations that replace sensor.yaml; TUM VI has the second."""
 SAME_NS = 1_000_000
-"""Images of both eyes further apart than 1 ms are not of one moment."""
+"""Images of both eyes more than 1 ms apart are not a pair."""
 
 
 class AslRig(RigSource):
-    """A folder `mav0` or the one that holds it: cam0 and cam1 with images named or listed by ns, calibration and poses.
+    """A folder `mav0` or its parent: cam0 and cam1 with images named or listed by ns, calibration and poses.
 
     where: the folder, or with options `MH_01_easy?rectify=pinhole&poses=CameraTrajectory.txt&axes=optical`:
-        rectify: `pinhole`, `spherical` or `cylindrical`; without it spherical for fisheyes, else pinhole.
-        poses: a file or folder of poses of any form (see `rgbd.pose_files`), of the body.
-        axes: the poses are those of the left eye instead, in `optical`, `opengl` or `ros` axes. invert: 1 where they
-        map the world into what is posed.
+        rectify: `pinhole`, `spherical` or `cylindrical`; default: spherical for fisheyes, else pinhole.
+        poses: a file or folder of poses of the body in any form (see `rgbd.pose_files`).
+        axes: the poses are the left eye's instead, in `optical`, `opengl` or `ros` axes. invert: 1 if they
+        map the world into the posed frame.
         imu: `off` to leave imu0 out.
-    posed: without it poses are not looked for, and are NaN.
-    Images: `cam0/data.csv` (lines `ns,file`), else all `cam0/data/*.png`; those that the list names but that are not
-    there are left out, with a note. The right image is that of the same time, or less than 1 ms away.
+    posed: if False, poses are not searched for, and are NaN.
+    Images: `cam0/data.csv` (lines `ns,file`), else all `cam0/data/*.png`; listed but missing ones
+    are left out, with a note. The right image is the one of the same time, or less than 1 ms away.
     Calibration: `sensor.yaml` of both cameras, else a camchain.yaml of Kalibr there, above or in `dso/`.
     Poses: data.csv of `state_groundtruth_estimate0`, `mocap0` or `vicon0` (ns, metres, quaternion w x y z, then
     anything), moved from that sensor to the body by its T_BS; else T_world_body in poses.txt or groundtruth.txt (TUM
     format).
-    IMU: `imu0/data.csv` (ns, rad/s, m/s^2), mounted as T_BS of its sensor.yaml says; the body's frame without.
-    World, poses and faults: see `RigSource`. Raises SourceError for what is missing or wrong as a whole.
+    IMU: `imu0/data.csv` (ns, rad/s, m/s^2), mounted by T_BS of its sensor.yaml, or in the body's frame without it.
+    World, poses and faults: see `RigSource`. Raises SourceError if a part is missing or invalid as a whole.
     """
 
     layout = "a EuRoC / ASL folder (mav0 with cam0, cam1 and state_groundtruth_estimate0)"
@@ -107,7 +107,7 @@ class AslRig(RigSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder `mav0`, or holds one, with a camera in it."""
+        """Return whether `where` is or contains a folder `mav0` with a camera in it."""
         return _root(folder_part(where)) is not None
 
 
@@ -125,7 +125,7 @@ class _Images:
             self.files = {stamp: name for stamp, name in listed.items() if name in present}
             lost = len(listed) - len(self.files)
             if lost:
-                self.notes = (f"{camera / DATA}: names {len(listed)} images, {lost} of them are not there: left out",)
+                self.notes = (f"{camera / DATA}: lists {len(listed)} images, {lost} of them are missing: left out",)
         else:
             self.files = {_stamp(self.folder / name): name for name in present}
         if not self.files:
@@ -133,7 +133,7 @@ class _Images:
         self.stamps = sorted(self.files)
 
     def nearest(self, stamp_ns: int) -> Path:
-        """Return the image of a time, or the name it would have if none is near."""
+        """Return the image at a time, or the name it would have if none is near."""
         after = bisect_left(self.stamps, stamp_ns)
         near = self.stamps[max(after - 1, 0) : after + 1]
         best = min(near, key=lambda stamp: abs(stamp - stamp_ns))
@@ -141,7 +141,7 @@ class _Images:
 
 
 def _root(where: str) -> Path | None:
-    """Return the folder that holds the cameras, None if missing."""
+    """Return the folder that contains the cameras, None if there is none."""
     for root in (Path(where) / ROOT, Path(where)):
         for eye in EYES:
             if any(os.path.exists(root / eye / name) for name in (DATA, SENSOR, "data")):
@@ -154,7 +154,7 @@ def _shots(left: _Images, right: _Images) -> list[Shot]:
 
 
 def _calibration(root: Path) -> tuple[StereoCalibration, str]:
-    """Return the pair and the file that tells of it."""
+    """Return the calibration of the pair and the file it comes from."""
     sensors = [root / eye / SENSOR for eye in EYES]
     missing = [path for path in sensors if not os.path.isfile(path)]
     if not missing:
@@ -173,7 +173,7 @@ def _poses(root: Path) -> Poses:
     for path in (place / name for place in (root, root.parent) for name in TEXTS):
         if os.path.isfile(path):
             return Trajectory(path)
-    said = "leica0 has positions but no directions" if os.path.isdir(root / "leica0") else "no poses of the vehicle"
+    said = "leica0 has positions but no orientations" if os.path.isdir(root / "leica0") else "no poses of the vehicle"
     raise NoPoses(
         f"{root}: {said}; put {TRUTHS[0]}/{DATA} or {TRUTHS[1]}/{DATA} there, "
         f"or {TEXTS[0]} with lines 'stamp tx ty tz qx qy qz qw' (seconds), or add ?poses=FILE"
@@ -203,7 +203,7 @@ def _truth(folder: Path) -> Poses:
 
 
 def _mount(path: Path) -> Transform:
-    """Return T_BS (4, 4), which maps the frame of the poses into the body's; the identity if nothing is said."""
+    """Return T_BS (4, 4), which maps the frame of the poses into the body's; the identity by default."""
     table = read_yaml(path) if os.path.isfile(path) else {}
     try:
         return rigid(table["T_BS"], "T_BS") if "T_BS" in table else np.eye(4)
@@ -216,7 +216,7 @@ def _readings(folder: Path, T_body_camera: Transform) -> ImuReadings:
     rows = _rows(path)[0]
     numbers = np.full((len(rows), 6), np.nan)
     for row, (words, _) in zip(numbers, rows, strict=True):
-        with suppress(ValueError):  # then it stays without a value, and is left out
+        with suppress(ValueError):  # the row stays NaN and is left out
             row[:] = [float(word) for word in words[1:7]]
     stamps = [_ns(words[0], where) for words, where in rows]
     mount = inverse(T_body_camera) @ _mount(folder / SENSOR)
@@ -247,7 +247,7 @@ def _list(path: Path) -> dict[int, str]:
 
 
 def _rows(path: Path) -> tuple[list[tuple[list[str], str]], list[str]]:
-    """Return the rows of a list with commas, each with `file:line`, and the words of its header, which may lack `#`."""
+    """Return the rows of a comma-separated list, each with `file:line`, and its header's words, with or without `#`."""
     try:
         lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
@@ -266,11 +266,11 @@ def _rows(path: Path) -> tuple[list[tuple[list[str], str]], list[str]]:
 
 def _ns(word: str, where: str) -> int:
     if not (word.isascii() and word.isdecimal() and int(word) < 2**63):
-        raise SourceError(f"{where}: '{word[:30]}' is no time in whole nanoseconds; correct or delete the line")
+        raise SourceError(f"{where}: '{word[:30]}' is not a time in whole nanoseconds; correct or delete the line")
     return int(word)
 
 
 def _stamp(path: Path) -> int:
     if not (path.stem.isascii() and path.stem.isdecimal() and int(path.stem) < 2**63):
-        raise SourceError(f"{path}: its name is no time in nanoseconds; rename it, or list the images in {DATA}")
+        raise SourceError(f"{path}: its name is not a time in nanoseconds; rename it, or list the images in {DATA}")
     return int(path.stem)

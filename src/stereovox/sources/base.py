@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 class Lazy(Sequence[T]):
-    """The items `read(k)` for the numbers `k`, read each time they are accessed; slices are lazy too."""
+    """The items `read(k)` for the numbers `k`, read at each access; slices are lazy too."""
 
     def __init__(self, read: Callable[[int], T], numbers: range):
         self._read, self._numbers = read, numbers
@@ -45,10 +45,10 @@ class Lazy(Sequence[T]):
 
 
 class Part(NamedTuple):
-    """Part of a recording that a layout needs.
+    """A part of a recording that a layout needs.
 
-    patterns: names inside the folder as in `glob`, of which one must be there; the first is the usual one. what: what
-    it holds, in words. cure: what to do if it is missing, if that is not just to put it there.
+    patterns: names inside the folder as in `glob`, of which one must exist; the first is the usual one. what: its
+    content, in words. cure: what to do if it is missing, other than adding it.
     """
 
     patterns: tuple[str, ...]
@@ -56,7 +56,7 @@ class Part(NamedTuple):
     cure: str = ""
 
     def count(self, folder: str | os.PathLike[str]) -> int:
-        """Return how many files or folders match; 0 where the folder cannot be read."""
+        """Return how many files or folders match; 0 if the folder is unreadable."""
         try:
             return max(sum(1 for _ in Path(folder).glob(pattern)) for pattern in self.patterns)
         except (OSError, ValueError):
@@ -68,20 +68,20 @@ AHEAD = 4
 
 
 class Stream(Protocol):
-    """Frames in time order from a recording or a live camera; it need not have a length nor be rewindable.
+    """Frames in time order from a recording or a live camera; it may lack a length and a way to rewind.
 
     A registered class also has `recognises(where: str) -> bool`, which is cheap and never raises, and is constructed
-    from `where` alone; it raises SourceError if the recording or device as a whole cannot be used.
+    from `where` alone; it raises SourceError if the recording or device as a whole is unusable.
 
     Attributes:
         name: Short name for messages and reports.
         camera: Camera of all frames; for stereo pairs the rectified left eye of the first (for a wide one its
             `middle`).
-        notes: Lines the user should see, for example a calibration that had to be assumed.
+        notes: Lines the user should see, for example about an assumed calibration.
         layout: How to recognise this kind of source, for messages.
-        parts: What a folder of this layout holds, to say what is missing in one that is nearly so.
-        up: The world's axis that points up (`z`, `-y`), where this kind of recording defines it; else None.
-        posed: Whether anything is known about where the camera was.
+        parts: Contents of a folder of this layout, to report what is missing.
+        up: The world's axis that points up (`z`, `-y`), if this kind of recording defines it; else None.
+        posed: Whether anything is known about the camera's poses.
         composite: The class combines other recordings; its second argument is the function that opens them (see
             `CameraPair`).
     """
@@ -102,7 +102,7 @@ class Stream(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Frames that a live camera delivered and that were not consumed in time; 0 for a recording."""
+        """Frames that a live camera delivered but that were not consumed in time; 0 for a recording."""
         return 0
 
     def after(self, count: int) -> Stream:
@@ -120,13 +120,13 @@ class Stream(Protocol):
         return self
 
     def imu(self) -> Imu | None:
-        """Read what the IMU next to the camera says.
+        """Read the IMU next to the camera.
 
         Returns:
             Its readings, by the clock of the images; None if there is no IMU.
 
         Raises:
-            SourceError: There is one that cannot be used.
+            SourceError: It is unusable.
         """
         return None
 
@@ -146,10 +146,10 @@ class Source(Stream, Protocol):
         return Selection(self, f"{count}:")
 
     def gravity(self) -> NDArray[np.float64] | None:
-        """Measure which way is up by an accelerometer.
+        """Measure the up direction by an accelerometer.
 
         Returns:
-            Unit vector (3,) in the world of the poses; None if the recording has nothing that tells.
+            Unit vector (3,) in the world of the poses; None if the recording does not contain it.
         """
         return None
 
@@ -158,7 +158,7 @@ class Source(Stream, Protocol):
     def frame(self, i: int) -> AnyFrame:
         """Read one frame.
 
-        A bad file never raises: the frame then has a `fault`.
+        A bad file never raises: the frame has a `fault` instead.
 
         Args:
             i: Number of the frame; negative from the end.
@@ -176,7 +176,7 @@ class Source(Stream, Protocol):
 
     @classmethod
     def depth_only(cls, where: str) -> Source:
-        """Open only the depth images; a recording that can do without its poses overrides this.
+        """Open only the depth images; a recording that can be read without poses overrides this.
 
         Args:
             where: As for the class itself.
@@ -187,7 +187,7 @@ class Source(Stream, Protocol):
         Raises:
             SourceError: As for the class itself.
         """
-        return cls(where)  # pyright: ignore[reportCallIssue] - what is registered is made from its place
+        return cls(where)  # pyright: ignore[reportCallIssue] - registered classes are constructed from `where`
 
 
 class DepthSource(Source, Protocol):
@@ -202,7 +202,7 @@ class DepthSource(Source, Protocol):
 
 
 class Changed(Stream):
-    """The frames of `stream`, each as `change` returns it; a class of this kind sets what else differs."""
+    """The frames of `stream`, each passed through `change`; subclasses set any other differences."""
 
     def __init__(self, stream: Stream):
         self._stream = stream
@@ -210,7 +210,7 @@ class Changed(Stream):
         self.posed = getattr(stream, "posed", True)
 
     def change(self, frame: AnyFrame) -> AnyFrame:
-        """Return a frame of the stream as it is to be delivered."""
+        """Return the frame to deliver for a frame of the stream."""
         raise NotImplementedError
 
     @property
@@ -228,7 +228,7 @@ class Changed(Stream):
         return imu_of(self._stream)
 
     def after(self, count: int) -> Stream:
-        """Return the remaining frames after `count`, changed in the same way."""
+        """Return the frames after `count`, changed in the same way."""
         rest = copy.copy(self)
         rest._stream = self._stream.after(count)
         return rest
@@ -239,7 +239,7 @@ class Changed(Stream):
             yield from map(self.change, frames)
         finally:
             close = getattr(frames, "close", None)
-            if close:  # a generator: a live camera is to stop now
+            if close:  # a generator: a live camera must stop now
                 close()
 
 
@@ -257,13 +257,13 @@ class Selection(Source):
         self.whole = source
         self.picked = range(len(source))[parse_slice(frames)]
         if not self.picked:
-            raise SourceError(f"frames '{frames}' picks none of the {len(source)} frames of {source.name}; widen it")
+            raise SourceError(f"frames '{frames}' selects none of the {len(source)} frames of {source.name}; widen it")
         self.name, self.camera = source.name, source.camera
         self.notes, self.up = getattr(source, "notes", ()), getattr(source, "up", None)
 
     def gravity(self) -> NDArray[np.float64] | None:
-        """Return which way is up in the whole recording."""
-        measure = getattr(self.whole, "gravity", None)  # a class of another package may lack it
+        """Return the up direction of the whole recording."""
+        measure = getattr(self.whole, "gravity", None)  # classes of other packages may lack it
         return measure() if measure else None
 
     def imu(self) -> Imu | None:
@@ -279,7 +279,7 @@ class Selection(Source):
 
 
 def pose_reader(source: Stream) -> Callable[[int], Transform] | None:
-    """Return what reads the pose of a frame, by its number, without the image; None for a source that has no such.
+    """Return a reader of poses by frame number that skips the images; None if the source has none.
 
     It raises FrameRefused for a frame without a pose.
     """
@@ -292,7 +292,7 @@ def pose_reader(source: Stream) -> Callable[[int], Transform] | None:
 class Excerpt(Stream):
     """The frames that the Python slice `frames` (`A:B:S`, as text) selects from a live camera, counted from now.
 
-    Raises SourceError for text that is not a slice, selects nothing, or counts from the end, which a live camera lacks.
+    Raises SourceError if the text is not a slice, selects nothing, or counts from the end, which a live camera lacks.
     """
 
     def __init__(self, stream: Stream, frames: str):
@@ -302,13 +302,13 @@ class Excerpt(Stream):
             raise SourceError(f"frames '{frames}' of a live camera: count forwards from its first, for example :300")
         self._stream, self._bounds = stream, (start, picked.stop, step)
         if max(start, picked.stop or 0, step) > sys.maxsize:
-            raise SourceError(f"frames '{frames}' of a live camera: so many never come; give smaller numbers")
+            raise SourceError(f"frames '{frames}' of a live camera: numbers too large; give smaller ones")
         self.name, self.camera = stream.name, stream.camera
         self.notes, self.posed = getattr(stream, "notes", ()), getattr(stream, "posed", True)
 
     @property
     def dropped(self) -> int:
-        """Frames that the camera delivered and that were not consumed in time."""
+        """Frames that the camera delivered but that were not consumed in time."""
         return self._stream.dropped
 
     def imu(self) -> Imu | None:
@@ -321,12 +321,12 @@ class Excerpt(Stream):
             yield from islice(frames, *self._bounds)
         finally:
             close = getattr(frames, "close", None)
-            if close:  # a generator: the camera is to stop now, not when it happens to be collected
+            if close:  # a generator: the camera must stop now, not at garbage collection
                 close()
 
 
 def imu_of(stream: Stream) -> Imu | None:
-    """Return the IMU of a stream, None if it has none; a class of another package may not know of such a thing."""
+    """Return the IMU of a stream, None if it has none; classes of other packages may lack the method."""
     read = getattr(stream, "imu", None)
     return read() if read else None
 
@@ -339,7 +339,9 @@ def parse_slice(text: str) -> slice:
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or numbers[2:] == [0]:
-        raise SourceError(f"frames '{text}' is no slice; write A:B:S with whole numbers, for example 0:100:2") from None
+        raise SourceError(
+            f"frames '{text}' is not a slice; write A:B:S with whole numbers, for example 0:100:2"
+        ) from None
     return slice(*numbers)
 
 

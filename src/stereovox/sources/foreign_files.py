@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of other programs that are no recordings here, and what makes one of them."""
+"""Files of other programs that are not recordings, and how to convert them."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ AZURE = (
     "is a video; if an Azure Kinect's, export depth with Open3D's azure_kinect_mkv_reader.py --input {file} "
     "--output DIR, and add poses.txt there"
 )
-PICTURE = "is a file with one image; give the folder that holds all of them, with their poses"
+PICTURE = "is a single image; give the folder that holds all images, with their poses"
 CURES = {
     **dict.fromkeys((".svo", ".svo2"), ZED),
     ".mkv": AZURE,
     ".oni": "is an OpenNI recording; write its depth as 16-bit PNGs into DIR/depth with OpenNI (Python: "
     "openni2.Device.open_file), add poses.txt and the camera, and give DIR",
-    ".rrd": "is a Rerun log, which is for looking; give the recording or map that it was made of",
+    ".rrd": "is a Rerun log, which is only for viewing; give the recording or map that it was made from",
     ".r3d": "is a Record3D scan; in the app export it as 'EXR + RGB', unpack that and give its folder",
-    ".rec": "is a recording of a program that is not known; export depth images and poses.txt",
+    ".rec": "is a recording of an unknown program; export depth images and poses.txt",
     **dict.fromkeys((".h5", ".hdf5", ".mat", ".tfrecord"), "is a table of arrays; write its depth images as 16-bit "
                     "PNGs into DIR/depth, DIR/poses.txt and the camera, and give DIR"),
     **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".bz2", ".xz"), ARCHIVE),
     **dict.fromkeys((".mp4", ".mov", ".avi", ".webm"), VIDEO),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".exr", ".npy"), PICTURE),
 }  # fmt: skip
-"""What each kind of file is and its cure, by suffix in lower case; `{file}` is its name as a shell needs it."""
+"""Description of each kind of file and its cure, by suffix in lower case; `{file}` is its name quoted for a shell."""
 MAX_NAME = 60
-"""Longest name that a line repeats."""
+"""Longest file name that a message repeats."""
 
 
 def cure_of(path: str | os.PathLike[str]) -> str:
-    """Say in less than 200 characters what a file is and how to make a recording or map of it; "" for others."""
+    """Return in less than 200 characters what a file is and how to convert it; "" for others."""
     found = CURES.get(os.path.splitext(path)[1].lower(), "")
     name = shlex.quote(os.fspath(path))
     return found.format(file=name if len(name) <= MAX_NAME else "FILE")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """PNG images and folders of them; only intact files are decoded.
 
-Decoders differ on damaged files: half an image, noise, or lines on the terminal from the C library. So the file's own
+Decoders differ on damaged files: half an image, noise, or output of the C library on the terminal. So the file's own
 checksums are verified first (0.02 ms for 90 kB).
 """
 
@@ -23,15 +23,15 @@ from stereovox.files.safe_io import read_bounded
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
-HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
+HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, checksum
 MAX_BYTES = 1 << 28
-"""Largest file: more than the most pixels can need."""
+"""Largest file: more than the largest image can need."""
 MAX_RATIO = 1100
 """Most bytes that one byte of a PNG can decompress to (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
 DEPTH_KINDS = frozenset({GREY_16})
 PICTURE_KINDS = frozenset({(8, 0), (8, 2)})
-"""Kinds of PNG that are read: 16-bit grey; 8-bit grey and RGB."""
+"""Supported kinds of PNG: 16-bit grey; 8-bit grey and RGB."""
 EYE_KINDS = frozenset({GREY_16, (8, 0), (8, 2), (8, 6)})
 """Kinds of PNG that stereo cameras write: also 16-bit grey (TUM VI), and RGB with transparency."""
 EXPECTED = {
@@ -45,7 +45,7 @@ Kinds = frozenset[tuple[int, int]]
 def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
     """Return the (height, width) uint16 image in the bytes of a PNG; `path` names it in messages.
 
-    Its size must be (width, height) = `size`. Raises FrameRefused: `missing_file`; `unreadable` (no PNG, cut off,
+    Its size must be (width, height) = `size`. Raises FrameRefused: `missing_file`; `unreadable` (not a PNG, cut off,
     damaged, absurdly large); `bad_dtype` (not 16-bit grey); `bad_shape` (another size).
     """
     _check(path, data, size, DEPTH_KINDS)
@@ -60,7 +60,7 @@ def decode_png(
 ) -> NDArray[np.generic]:
     """Return the image in the bytes of a PNG of one of `kinds`, as OpenCV gives it; `path` names it in messages.
 
-    size: (width, height) that it must have; None: any. expected: which kinds are read, for the message.
+    size: required (width, height); None: any. expected: supported kinds, for the message.
     Raises FrameRefused as `decode_depth_png`.
     """
     _check(path, data, size or _header_size(path, data, kinds, expected), kinds, expected)
@@ -70,8 +70,8 @@ def decode_png(
 def read_picture_png(path: Path, size: tuple[int, int], kinds: Kinds = PICTURE_KINDS) -> NDArray[np.uint8]:
     """Return the (height, width) uint8 grey or (height, width, 3) uint8 RGB image in `path`.
 
-    Its size must be (width, height) = `size`. Where `kinds` allow them, images of 16 bits keep the upper eight, and
-    transparency is ignored. Raises FrameRefused as `decode_depth_png`; `bad_dtype`: of none of these kinds.
+    Its size must be (width, height) = `size`. If `kinds` allow them, images of 16 bits keep the upper eight, and
+    transparency is ignored. Raises FrameRefused as `decode_depth_png`; `bad_dtype`: none of these kinds.
     """
     data = _read(path)
     _check(path, data, size, kinds)
@@ -81,7 +81,7 @@ def read_picture_png(path: Path, size: tuple[int, int], kinds: Kinds = PICTURE_K
     image = image[..., :3] if image.shape[2:] == (4,) else image
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
         raise _undecodable(path)
-    return np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image, np.uint8)  # OpenCV gives BGR
+    return np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image, np.uint8)  # OpenCV returns BGR
 
 
 def png_size(path: Path, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int]:
@@ -98,7 +98,7 @@ def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KI
         try:
             found[png_size(path, kinds)] += 1
         except FrameRefused:
-            continue  # it is reported when its turn comes
+            continue  # reported when it is read
         if found.total() == samples:
             break
     return found.most_common(1)[0][0] if found else None
@@ -109,7 +109,7 @@ def file_names(folder: Path) -> list[str]:
     try:
         return os.listdir(folder)
     except OSError as error:
-        raise SourceError(f"{folder}: {error.strerror}; give a folder you may read") from None
+        raise SourceError(f"{folder}: {error.strerror}; give a readable folder") from None
 
 
 def spread(paths: Sequence[Path], samples: int) -> list[Path]:
@@ -144,10 +144,10 @@ def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds, e
 def _header_size(path: Path | str, data: bytes, kinds: Kinds, expected: str = "") -> tuple[int, int]:
     header = data[12 : HEADER_BYTES - 4]
     if data[:16] != START or zlib.crc32(header) != int.from_bytes(data[HEADER_BYTES - 4 : HEADER_BYTES]):
-        raise FrameRefused("unreadable", f"{path}: no PNG file, or its header is damaged; copy it again or remove it")
+        raise FrameRefused("unreadable", f"{path}: not a PNG, or its header is damaged; copy it again or remove it")
     width, height, bits, colour = struct.unpack_from(">IIBB", header, 4)
     if not 0 < width * height <= MAX_PIXELS:
-        raise FrameRefused("unreadable", f"{path}: its header tells of {size_text((width, height))} pixels; remove it")
+        raise FrameRefused("unreadable", f"{path}: its header declares {size_text((width, height))} pixels; remove it")
     if (bits, colour) not in kinds:
         kind = "grey" if colour == 0 else "colour"
         raise FrameRefused("bad_dtype", f"{path}: {bits}-bit {kind} image; {expected or EXPECTED[kinds]}")

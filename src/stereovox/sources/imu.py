@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an inertial measurement unit (IMU) next to a camera says: how fast it turns, and what it feels."""
+"""The readings of an inertial measurement unit (IMU) next to a camera: angular rate and specific force."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ RIGID = 1e-3
 KEPT = 20_000
 """Readings of a live IMU that are kept: 50 s at 400 Hz."""
 ACROSS_S = 0.1
-"""Longest time between two accelerations that is bridged."""
+"""Longest time between two accelerations that is interpolated."""
 GRAVITY = 9.0, 10.6
-"""Length in m/s^2 that a mean specific force must have to say which way is up."""
+"""Range in m/s^2 for the length of a mean specific force that is used as the up direction."""
 
 
 class Imu(Protocol):
-    """An IMU that is mounted on a camera: `ImuReadings` of a recording, `LiveImu` of a camera that is connected."""
+    """An IMU mounted on a camera: `ImuReadings` of a recording, `LiveImu` of a connected camera."""
 
     @property
     def name(self) -> str:
-        """Where it is from, for messages."""
+        """Origin of the readings, for messages."""
         ...
 
     def between(self, begin_ns: int, end_ns: int) -> ImuReadings:
-        """Return the readings that cover a span of time, as far as there are some.
+        """Return the readings that cover a span of time, as far as available.
 
         Args:
-            begin_ns: Its begin in nanoseconds, by the clock of the images.
+            begin_ns: Its start in nanoseconds, by the clock of the images.
             end_ns: Its end.
 
         Returns:
-            Those within, the last one before and the first one after; perhaps none.
+            Readings inside, the last one before and the first one after; perhaps none.
         """
         ...
 
@@ -52,14 +52,16 @@ class ImuReadings:
     Attributes:
         stamps_ns: (N,) int64 nanoseconds, ascending.
         angular_rate: (N, 3) float64 rad/s about the IMU's axes, finite.
-        specific_force: (N, 3) float64 m/s^2 along the IMU's axes: what an accelerometer feels, at rest 9.8 upwards; NaN
-            where it says nothing.
-        T_sensor_imu: (4, 4) float64, maps the IMU's frame into the optical frame of the images; only its rotation is
-            used.
-        name: Where they are from, for messages.
+            specific_force: (N, 3) float64 m/s^2 along the IMU's axes: an accelerometer's reading, at rest 9.8 upwards;
+            NaN
+                if missing.
+            T_sensor_imu: (4, 4) float64, maps the IMU's frame into the optical frame of the images; only its rotation
+            is
+                used.
+            name: Origin of the readings, for messages.
 
-    Raises:
-        StereovoxError: Something of this is not so.
+        Raises:
+            StereovoxError: An attribute is invalid.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -80,7 +82,9 @@ class ImuReadings:
         if not np.isfinite(self.angular_rate).all():
             raise StereovoxError(f"{self.name}: angular_rate must be finite rad/s; leave other readings out")
         if not rigidity_error(self.T_sensor_imu) < RIGID:
-            raise StereovoxError(f"{self.name}: T_sensor_imu is no rigid motion; give a (4, 4) rotation and shift")
+            raise StereovoxError(
+                f"{self.name}: T_sensor_imu is not a rigid motion; give a (4, 4) rotation and translation"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -90,7 +94,7 @@ class ImuReadings:
 
     @property
     def rate_hz(self) -> float:
-        """Readings a second: the median; 0 with fewer than two."""
+        """Median number of readings per second; 0 with fewer than two."""
         return 1e9 / float(np.median(np.diff(self.stamps_ns))) if len(self) > 1 else 0.0
 
     def between(self, begin_ns: int, end_ns: int) -> ImuReadings:
@@ -116,7 +120,7 @@ def checked_imu(where: str, option: str) -> str:
 def in_order(
     stamps_ns: ArrayLike, angular_rate: ArrayLike, specific_force: ArrayLike, T_sensor_imu: Transform, name: str
 ) -> ImuReadings:
-    """Return readings of a file, sorted, without those that repeat a time or have no finite angular rate.
+    """Return readings of a file, sorted, without repeated times and without non-finite angular rates.
 
     Args as the attributes of `ImuReadings`. Raises SourceError if fewer than two are left.
     """
@@ -126,14 +130,14 @@ def in_order(
     _, first = np.unique(stamps[known], return_index=True)
     kept = known[first]
     if len(kept) < 2:
-        raise SourceError(f"{name}: holds {len(kept)} readings that can be used; leave the IMU out with imu=off")
+        raise SourceError(f"{name}: holds {len(kept)} usable readings; leave the IMU out with imu=off")
     return ImuReadings(stamps[kept], rate[kept], force[kept], T_sensor_imu, name)
 
 
 def at_times(stamps_ns: NDArray[np.int64], values: NDArray[np.float64], wanted_ns: ArrayLike) -> NDArray[np.float64]:
-    """Return values (N, 3) of ascending times at other times (M,): on straight lines between neighbours.
+    """Return values (N, 3) of ascending times, linearly interpolated at other times (M,).
 
-    NaN before the first, after the last and where neighbours are more than ACROSS_S apart.
+    NaN before the first, after the last and if neighbours are more than ACROSS_S apart.
     """
     wanted = np.asarray(wanted_ns, np.int64)
     if not len(stamps_ns):
@@ -148,17 +152,17 @@ def at_times(stamps_ns: NDArray[np.int64], values: NDArray[np.float64], wanted_n
 
 
 def up_of_force(force: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the unit vector (3,) along a mean force, in m/s^2; None if it has not the length of gravity."""
+    """Return the unit vector (3,) along a mean force, in m/s^2; None if its length is not that of gravity."""
     length = float(np.linalg.norm(force))
     return force / length if GRAVITY[0] <= length <= GRAVITY[1] else None
 
 
 class LiveImu:
-    """An IMU whose readings arrive one by one; any thread may add some while another one reads.
+    """An IMU whose readings arrive one by one; one thread may add some while another reads.
 
     Args:
         T_sensor_imu: (4, 4), as in `ImuReadings`.
-        name: Where they are from, for messages.
+        name: Origin of the readings, for messages.
     """
 
     def __init__(self, T_sensor_imu: Transform | None = None, name: str = "IMU"):
@@ -167,10 +171,10 @@ class LiveImu:
         self._turns: deque[tuple[int, ArrayLike]] = deque(maxlen=KEPT)
         self._forces: deque[tuple[int, ArrayLike]] = deque(maxlen=KEPT)
         self._lock = Lock()
-        _arrays([], [], self._mount, name)  # which complains of a mount that is none
+        _arrays([], [], self._mount, name)  # refuses an invalid mount
 
     def add_angular_rate(self, stamp_ns: int, rate: ArrayLike) -> None:
-        """Take in a reading of the gyroscope: (3,) rad/s; one that is not later than the last, or not finite, is left.
+        """Add a reading of the gyroscope: (3,) rad/s; ignored if it is not later than the last, or not finite.
 
         Args:
             stamp_ns: Its time in nanoseconds, by the clock of the images.
@@ -179,7 +183,7 @@ class LiveImu:
         self._add(self._turns, stamp_ns, rate)
 
     def add_specific_force(self, stamp_ns: int, force: ArrayLike) -> None:
-        """Take in a reading of the accelerometer: (3,) m/s^2, as `add_angular_rate`.
+        """Add a reading of the accelerometer: (3,) m/s^2, as `add_angular_rate`.
 
         Args:
             stamp_ns: Its time in nanoseconds, by the clock of the images.
@@ -197,7 +201,7 @@ class LiveImu:
 
     @property
     def seconds(self) -> float:
-        """Time that the readings of the gyroscope span."""
+        """Time span of the gyroscope's readings."""
         with self._lock:
             return (self._turns[-1][0] - self._turns[0][0]) / 1e9 if self._turns else 0.0
 
@@ -209,7 +213,7 @@ class LiveImu:
 
 
 def _around(kept: deque[tuple[int, ArrayLike]], begin_ns: int, end_ns: int) -> list[tuple[int, ArrayLike]]:
-    """Return readings that cover a span, in order; from the newest on, since the span is usually the latest."""
+    """Return readings that cover a span, in order; searched from the newest, since the span is usually the latest."""
     found = []
     for one in reversed(kept):
         if one[0] > end_ns + ACROSS_S * 1e9:

@@ -14,13 +14,13 @@ from stereovox.sources.imu import Imu
 
 T = TypeVar("T")
 WAITING = 2
-"""Frames kept while the map is busy: one to go on with, and one that arrives meanwhile."""
+"""Frames kept while the map is busy: one to continue with, and one that arrives meanwhile."""
 STOPPING_S = 6.0
 """Seconds a camera has to deliver its last frame before its thread is abandoned; RealSense gives up after 5."""
 
 
 class Latest(Generic[T]):
-    """The newest items of an iterable, read by its own thread, so that a slow consumer never holds the camera up.
+    """The newest items of an iterable, read by its own thread, so that a slow consumer never delays the camera.
 
     The newest `waiting` items are kept in order; for each further one the oldest is dropped and counted. An exception
     of `frames` is raised to the consumer after the items before it; the end of `frames` ends the iteration. When the
@@ -30,7 +30,7 @@ class Latest(Generic[T]):
             mapper.add(frame)
 
     Args:
-        frames: What the thread iterates over, usually a live camera.
+        frames: The iterable for the thread, usually a live camera.
         waiting: Items kept, at least one.
 
     Attributes:
@@ -63,11 +63,11 @@ class Latest(Generic[T]):
                         break
             finally:
                 close = getattr(frames, "close", None)
-                if close:  # a generator: the camera is to stop now
+                if close:  # a generator: the camera must stop now
                     close()
         except Exception as raised:
             error = raised
-        finally:  # also if a library ends the thread: nobody may wait for it
+        finally:  # even if a library ends the thread: no consumer may wait forever
             queue.end(error)
 
 
@@ -120,7 +120,7 @@ class LatestStream(Stream):
 
     @property
     def dropped(self) -> int:
-        """Frames that the camera delivered and that were not consumed in time."""
+        """Frames that the camera delivered but that were not consumed in time."""
         return self._latest.dropped
 
     def imu(self) -> Imu | None:

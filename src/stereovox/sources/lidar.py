@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of recordings with a lidar: scans, annotated boxes, and masks of what moved."""
+"""The protocol of recordings with a lidar: scans, annotated boxes, and masks of moving pixels."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Box:
 
     T_world_box: (4, 4) float64, maps the box's frame into the world: origin in its centre, x along its length, y along
         its width, z along its height (up). size: length, width and height in metres.
-    kind: what it is, as the annotation calls it; track: its number in the whole recording, -1 unknown.
+    kind: the annotation's class name; track: its number in the whole recording, -1 unknown.
     """
 
     T_world_box: Transform
@@ -69,7 +69,7 @@ class LidarSource(Protocol):
     def scan(self, i: int) -> LidarScan | None:
         """Return the scan of frame `i`, None if the recording has none at all.
 
-        Raises FrameRefused: `missing_file`, `unreadable` (cut off), and what `viewpoint` raises.
+        Raises FrameRefused: `missing_file`, `unreadable` (cut off), and as `viewpoint`.
         """
         ...
 
@@ -78,12 +78,12 @@ class LidarSource(Protocol):
         ...
 
     def moving(self, i: int) -> NDArray[np.bool_] | None:
-        """Return which pixels (height, width) of the left image show something that moved; None if not recorded."""
+        """Return the mask (height, width) of moving pixels in the left image; None if not recorded."""
         ...
 
 
 def read_velodyne(path: Path) -> NDArray[np.float32]:
-    """Return the points (N, 3) float32 of a KITTI `.bin`, those that are not finite left out.
+    """Return the finite points (N, 3) float32 of a KITTI `.bin`.
 
     Raises FrameRefused: `missing_file`; `unreadable` if the file holds no points or is cut off.
     """
@@ -94,7 +94,7 @@ def read_velodyne(path: Path) -> NDArray[np.float32]:
     except OSError as error:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable") from None
     if not data or len(data) % POINT_BYTES:
-        what = f"{len(data)} bytes are no whole number of points (4 float32 each)" if data else "holds no point"
+        what = f"{len(data)} bytes are not a whole number of points (4 float32 each)" if data else "holds no point"
         raise FrameRefused("unreadable", f"{path}: {what}; copy it again or leave its frame out")
     points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float32)
     return points[np.isfinite(points).all(axis=1)]

@@ -18,13 +18,13 @@ class Paced(Stream):
 
     Args:
         source: The recording or simulation.
-        rate: How much faster than real time.
-        restamp: Stamp the first frame with the present time and the others as much later as they were; else keep
+        rate: Speed relative to real time.
+        restamp: Stamp the first frame with the current time and keep the intervals between frames; else keep
             their stamps.
 
     Attributes:
         source: The recording or simulation.
-        late: Number of frames that the recording did not deliver in time, by more than half a frame at 30 Hz.
+        late: Number of frames that the recording delivered late, by more than half a frame at 30 Hz.
     """
 
     LATE_NS = 16_000_000

@@ -14,7 +14,7 @@ from stereovox.errors import SourceError, did_you_mean
 
 SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
 LARGEST = 2**63
-"""Largest whole number: beyond it none is useful, and none fits into a float for an error message."""
+"""Largest integer: larger ones are useless, and may not fit into a float for an error message."""
 
 
 def split(location: str) -> tuple[str, dict[str, str]]:
@@ -27,7 +27,7 @@ def split(location: str) -> tuple[str, dict[str, str]]:
     for text in filter(None, query.split("&")):
         key, equals, value = text.partition("=")
         if not (key and equals and value):
-            raise SourceError(f"'{text}' is no parameter; write key=value")
+            raise SourceError(f"'{text}' is not a parameter; write key=value")
         if key in texts:
             raise SourceError(f"'{key}' is given twice; give it once")
         texts[key] = value
@@ -35,7 +35,7 @@ def split(location: str) -> tuple[str, dict[str, str]]:
 
 
 def file_of(text: str, folder: Path) -> Path:
-    """Return the file or folder that a parameter names: as it stands, else inside `folder`; raises SourceError."""
+    """Return the file or folder that a parameter names: as given, else inside `folder`; raises SourceError."""
     found = next((path for path in (Path(text), folder / text) if os.path.exists(path)), None)
     if found is None:
         raise SourceError(f"{text}: no such file, nor in {folder}; check the name")

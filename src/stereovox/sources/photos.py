@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures that were taken along with depth images: JPEG, PNG and the like, as grey images."""
+"""Pictures taken with depth images: JPEG, PNG and the like, as grey images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
 FOLDERS = ("rgb", "color", "colour", "image", "images")
 """Folders of pictures next to one of depth images."""
 ASPECT = 0.01
-"""Share by which the ratio of sides may differ for a picture and a depth image to show the same."""
+"""Largest relative difference of the aspect ratios of a picture and a depth image with the same view."""
 
 
 def read_photo(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -48,16 +48,16 @@ def decode_photo(data: bytes, size: tuple[int, int], name: str) -> NDArray[np.ui
                 raise FrameRefused("bad_shape", f"{name}: {words}; remove it")
             if image.mode.startswith("I"):
                 return np.right_shift(np.asarray(image), 8).astype(np.uint8)
-            image.draft("L", size)  # of a JPEG, grey is all that is unpacked
+            image.draft("L", size)  # decode only the grey channel of a JPEG
             return np.asarray(image.convert("L"), np.uint8)
-    except FrameRefused:  # it is a ValueError, too
+    except FrameRefused:  # it is also a ValueError
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise FrameRefused("unreadable", f"{name}: {str(error)[:80]}; copy it again or remove it") from None
 
 
 def photo_size(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) of the picture in a file, None if it is none that can be read."""
+    """Return (width, height) of the picture in a file, None if it is not a readable picture."""
     from PIL import Image
 
     try:
@@ -70,7 +70,7 @@ def photo_size(path: Path) -> tuple[int, int] | None:
 def registered(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera | None:
     """Return the camera of pictures of (width, height) = `size` to which a depth camera's images are registered.
 
-    None if the ratio of their sides is another one: then they do not show the same.
+    None if the aspect ratio differs, because then the views differ.
     """
     if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > ASPECT:
         return None
@@ -82,7 +82,7 @@ def registered(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera | 
 
 
 def nearest_in_time(stamps_ns: Sequence[int], others_ns: Sequence[int], within_ns: int) -> list[int | None]:
-    """Return for each time the number of the other time that is nearest to it, None if none is near enough."""
+    """Return for each time the index of the nearest other time, None if none is near enough."""
     order = np.argsort(others_ns, kind="stable")
     others, stamps = np.asarray(others_ns, np.int64)[order], np.asarray(stamps_ns, np.int64)
     if not len(others):

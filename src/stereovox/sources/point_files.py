@@ -31,22 +31,22 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 FACES = ("face", "tristrips")
-"""Elements of a `.ply` that make a mesh of its points."""
+"""Elements of a `.ply` that turn its points into a mesh."""
 COLUMNS = "columns"
-"""The order of compressed points: all numbers of one field, little-endian, then all of the next."""
+"""Layout of compressed points: all numbers of one field, little-endian, then all of the next."""
 PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
 MAX_RATIO = 100
-"""Largest LZF compression ratio accepted; at best it makes 264 bytes of 3."""
+"""Largest LZF compression ratio accepted; at best 3 bytes expand to 264."""
 PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
 PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
 
 
 class Points(NamedTuple):
-    """Points as they stand in a file.
+    """Points as stored in a file.
 
-    xyz: (N, 3) float64. voxel_size: metres, where the file tells that of its cells. ply: whether it is a `.ply`. faces:
-    how many faces stand behind the points of a `.ply`. width, height: of an organised `.pcd`, whose points are the
-    pixels of an image; height 1 for all others. turned: whether a `.pcd` has a VIEWPOINT that turns or moves points.
+    xyz: (N, 3) float64. voxel_size: metres, if the file has the size of its cells. ply: whether it is a `.ply`. faces:
+    number of faces after the points of a `.ply`. width, height: of an organised `.pcd`, whose points are the
+    pixels of an image; height 1 for all others. turned: whether a `.pcd` has a VIEWPOINT that rotates or moves points.
     """
 
     xyz: NDArray[np.float64]
@@ -59,7 +59,7 @@ class Points(NamedTuple):
 
 
 def read_points(path: str | Path) -> Points:
-    """Return the points of a `.ply` or `.pcd` file; raises MapFileError: one line with the file and what is wrong."""
+    """Return the points of a `.ply` or `.pcd` file; raises MapFileError: one line with the file and the problem."""
     try:
         content = read_bounded(Path(path), MAX_BYTES)
         head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
@@ -73,7 +73,7 @@ def read_points(path: str | Path) -> Points:
 
 
 class _Head(NamedTuple):
-    """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin.
+    """record: one point: name, kind and count of its fields. order: "" for text. start: offset of the points.
 
     faces, shape and turned: as in `Points`; shape is None if there are no rows and columns.
     """
@@ -88,7 +88,7 @@ class _Head(NamedTuple):
 
 
 def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list[str]], int]:
-    """Return the words of the header's lines, up to and with the one that is `last`, and where the rest begins."""
+    """Return the words of the header's lines, up to the one that satisfies `last`, and the offset of the rest."""
     found, start = [], 0
     for line in content[:MAX_HEADER_LENGTH].splitlines(keepends=True):
         start += len(line)
@@ -96,7 +96,7 @@ def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list
         found.append(words)
         if last(words) and line.endswith((b"\n", b"\r")):
             return found, start
-    raise ValueError("its header does not end; it is no .ply or .pcd, or cut off")
+    raise ValueError("its header does not end; it is not a .ply or .pcd, or is cut off")
 
 
 def _ply_head(content: bytes) -> _Head:
@@ -108,7 +108,7 @@ def _ply_head(content: bytes) -> _Head:
                 order = PLY_ORDERS.get(form)
             case ["element", element, number]:
                 if element != "vertex" and count is None:
-                    raise ValueError(f"{shown(element)} stands before its vertices; write the vertices first")
+                    raise ValueError(f"{shown(element)} comes before its vertices; write the vertices first")
                 count = _count(number) if element == "vertex" else count
                 faces = _count(number) if element in FACES else faces
             case ["property", kind, name] if element == "vertex" and kind in PLY_TYPES:
@@ -116,7 +116,7 @@ def _ply_head(content: bytes) -> _Head:
             case ["property", *rest] if element == "vertex":
                 raise ValueError(f"its vertices have {shown(' '.join(rest))}, which no point has")
     if order is None or count is None:
-        raise ValueError("its header tells no format or no vertices")
+        raise ValueError("its header has no format or no vertices")
     return _Head(record, count, order, start, faces)
 
 
@@ -127,7 +127,7 @@ def _pcd_head(content: bytes) -> _Head:
     sizes, kinds = told.get("SIZE", []), told.get("TYPE", [])
     counts = told.get("COUNT", ["1"] * len(names))
     if not names or not len(names) == len(sizes) == len(kinds) == len(counts) <= MAX_FIELDS:
-        raise ValueError("FIELDS, SIZE, TYPE and COUNT do not tell the same number of fields")
+        raise ValueError("FIELDS, SIZE, TYPE and COUNT have different numbers of fields")
     if data not in PCD_ORDERS:
         raise ValueError(f"DATA is {shown(data)}, only {', '.join(PCD_ORDERS)} can be read")
     record = [(name, *one) for name, one in zip(names, map(_pcd_type, kinds, sizes, counts), strict=True)]
@@ -150,12 +150,12 @@ def _pcd_type(kind: str, size: str, count: str) -> tuple[str, int]:
 
 def _count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 16):
-        raise ValueError(f"{shown(text)} is no number of points")
+        raise ValueError(f"{shown(text)} is not a number of points")
     return int(text)
 
 
 def _xyz(body: bytes, head: _Head) -> NDArray[np.float64]:
-    """Return the points (N, 3); raises ValueError if the bytes do not suffice, before room is made for them."""
+    """Return the points (N, 3); raises ValueError, before memory is allocated, if there are too few bytes."""
     names = [name for name, _, _ in head.record]
     if any(names.count(axis) != 1 for axis in "xyz") or any(n > 1 for name, _, n in head.record if name in "xyz"):
         raise ValueError(f"its points have no x, y and z of one number each (they have {shown(' '.join(names))})")
@@ -168,7 +168,7 @@ def _packed_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float6
     starts = np.cumsum([0, *(head.number * kind.itemsize for kind in types)]).tolist()
     size, whole = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, -1)
     if whole != starts[-1] or size > len(body) - 8 or whole > MAX_RATIO * size:
-        raise ValueError(f"{head.number} points in {starts[-1]} bytes, packed in {len(body) - 8} bytes, cannot be")
+        raise ValueError(f"{head.number} points in {starts[-1]} bytes, packed in {len(body) - 8} bytes, are impossible")
     columns = np.empty(whole, np.uint8)
     if unpack(np.frombuffer(body, np.uint8, size, 8), columns) != whole:
         raise ValueError("its packed points are damaged")
@@ -195,7 +195,7 @@ def _text_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float64]
 
 
 def _numbers(text: bytes, most: int) -> Iterator[NDArray[np.float64]]:
-    """Yield the first numbers of a text, piece by piece: as words, all of them would take 20 times its room."""
+    """Yield the first numbers of a text, piece by piece: words of the whole text would take 20 times its memory."""
     start = 0
     while start < len(text) and most > 0:
         blank = BLANK.search(text, start + TEXT_PIECE)

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 STEPS = 10_000
-"""SQLite instructions between two checks of their number."""
+"""SQLite instructions between two checks of the step limit."""
 FAULTS = (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError)
-"""What reading a damaged file can raise; ValueError: texts that are none."""
+"""Errors of reading a damaged file; ValueError: invalid text."""
 
 
 class SqliteFile:
-    """A SQLite file that is only read; views, virtual tables and computed columns are refused.
+    """A SQLite file opened read-only; views, virtual tables and computed columns are refused.
 
     Args:
         path: The file.
@@ -24,7 +24,7 @@ class SqliteFile:
         longest: Most bytes of a value.
 
     Raises:
-        ValueError, sqlite3.Error: It is no SQLite file, is damaged, or a table is no plain one; see `FAULTS`.
+        ValueError, sqlite3.Error: It is not a SQLite file, is damaged, or a table is not a plain one; see `FAULTS`.
     """
 
     def __init__(self, path: Path, tables: Sequence[str], longest: int):
@@ -37,7 +37,7 @@ class SqliteFile:
         self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(longest, size))
         self._file.set_progress_handler(self._patience.is_over, STEPS)
         if self.rows(_suspicious(tables))[0][0]:
-            raise ValueError(f"{' or '.join(tables)} is no plain table")
+            raise ValueError(f"{' or '.join(tables)} is not a plain table")
 
     def rows(self, query: str, *values: Any) -> list[Any]:
         """Return all rows of a query; raises sqlite3.Error."""
@@ -63,7 +63,7 @@ class _StepLimit:
 
 
 def _suspicious(tables: Sequence[str]) -> str:
-    """Return the query that counts what is no plain table: SQLite would run what the file says."""
+    """Return the query that counts tables that are not plain: SQLite would run the file's own expressions."""
     names = ", ".join(f"'{name.lower()}'" for name in tables)
     columns = "".join(f" + (SELECT count(*) FROM pragma_table_xinfo('{name}') WHERE hidden)" for name in tables)
     return f"""SELECT (SELECT count(*) FROM sqlite_master WHERE lower(name) IN ({names})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording in another world: all poses turned by the same motion."""
+"""A recording in another world: all poses rotated by the same motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Turned(Changed):
 
 
 class TurnedRecording(Source):
-    """The same of a recording, whose frames can still be read in any order."""
+    """A recording in a new world, whose frames can still be read in any order."""
 
     def __init__(self, source: Source, T_new_world: Transform):
         self._source, self._T_new_world = source, T_new_world

@@ -16,7 +16,7 @@ class Arrival(Generic[T]):
     """A message waiting to become a frame.
 
     sensor: its topic. stamp_ns, frame_id: from its header. content: the message. arrived_ns: time of arrival by the
-    queue's clock; ready_ns: when all that it needs was there, None: not yet.
+    queue's clock; ready_ns: when everything it needs had arrived, None: not yet.
     """
 
     sensor: str
@@ -30,9 +30,9 @@ class Arrival(Generic[T]):
 class Waiting(Generic[T]):
     """A short queue for each sensor. Frames of one sensor keep their order.
 
-    max_length: frames that wait per sensor; one more drops the oldest, or returns it as it is if it is not ready.
-    wait_ns: a frame that is not ready after this time is returned as it is. late_ns: a frame that has been ready this
-    long is dropped where a newer one is ready too. dropped: number of dropped frames by sensor. clock: monotonic
+    max_length: frames that wait per sensor; one more drops the oldest, or returns it unready.
+    wait_ns: a frame that is not ready after this time is returned unready. late_ns: a frame that has been ready this
+    long is dropped if a newer one is ready too. dropped: number of dropped frames by sensor. clock: monotonic
     nanoseconds.
     """
 
@@ -54,11 +54,11 @@ class Waiting(Generic[T]):
     def pop(self, is_ready: Callable[[Arrival[T]], bool]) -> Arrival[T] | None:
         """Remove and return the next frame, the oldest among the first of each sensor; None if all must wait.
 
-        is_ready: returns whether everything that a frame needs is there.
+        is_ready: returns whether everything that a frame needs has arrived.
         """
         now = self._clock()
         for queue in self._queues.values():
-            for one in queue:  # also behind the first: how long a frame has been ready counts while others are mapped
+            for one in queue:  # also behind the first, since the time of readiness counts while others are mapped
                 self._note(one, is_ready, now)
         full = self._max_length + 1
         due = [queue for queue in self._queues.values() if queue and (len(queue) == full or self._due(queue[0], now))]

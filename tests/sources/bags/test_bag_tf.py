@@ -45,7 +45,7 @@ def test_a_chain_of_transforms_is_the_pose(tmp_path, ending):
     for k, frame in enumerate(source):
         assert (frame.fault, frame.stamp_ns) == (None, START_NS + k * 100 * MS)
         np.testing.assert_allclose(frame.T_world_sensor, planar_motion(k, 0, 0.2 * k) @ T_BASE_OPTICAL, atol=1e-9)
-    assert source.notes == (f"{source._file.path} /tf (odom -> optical): these poses count",)
+    assert source.notes == (f"{source._file.path} /tf (odom -> optical): these poses are used",)
 
 
 @ENDINGS
@@ -76,7 +76,7 @@ def test_transforms_that_only_tell_how_the_camera_is_mounted(tmp_path, ending):
         bag.depth(2)
     frame = Bag(bag.path).frame(0)
     assert frame.fault == "no_pose"
-    assert "reports how optical is mounted on camera_link, not where that was; put poses" in frame.fault_detail
+    assert "has the mount of optical on camera_link, but not where that was; put poses" in frame.fault_detail
 
 
 def test_frames_that_tf_does_not_know(tmp_path):
@@ -108,7 +108,7 @@ def test_a_topic_that_is_named_comes_first_and_is_told_of(tmp_path):
 
     path = walk(tmp_path / "a.bag", more=tracked)
     source = Bag(path)
-    assert "/tf (odom -> optical): these poses count; ?poses=/vicon for others" in source.notes[0]
+    assert "/tf (odom -> optical): these poses are used; ?poses=/vicon for others" in source.notes[0]
     np.testing.assert_allclose(source.frame(1).T_world_sensor, planar_motion(1, 0, 0.2) @ T_BASE_OPTICAL, atol=1e-9)
     np.testing.assert_allclose(Bag(f"{path}?poses=/vicon").frame(1).T_world_sensor, planar_motion(0, 7, 0))
     np.testing.assert_array_equal(Bag(f"{path}?pose=fixed").frame(1).T_world_sensor, np.eye(4))

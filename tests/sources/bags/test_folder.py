@@ -164,7 +164,7 @@ def test_without_metadata_the_numbered_files_are_taken(tmp_path):
     assert said(folder, "/a") == [f"/a{k:02}" for k in range(11)]
     notes = open_bag(folder).notes
     assert (
-        "no metadata.yaml, as after a recording that was cut off: walk_0.mcap, walk_1.mcap, walk_2.mcap and 8"
+        "no metadata.yaml, as after an interrupted recording: using walk_0.mcap, walk_1.mcap, walk_2.mcap and 8"
         in notes[0]
     )
     assert "walk_10.mcap: the file is cut off" in notes[1]
@@ -202,7 +202,7 @@ def test_files_outside_of_the_folder_are_not_opened(tmp_path):
 def test_metadata_that_names_no_files(tmp_path, names):
     folder = split(tmp_path / "walk", [("/a", 1)])
     describe(folder, names)
-    assert "metadata.yaml: names no files; write it anew with 'ros2 bag reindex'" in complaint(folder)
+    assert "metadata.yaml: names no files; write it again with 'ros2 bag reindex'" in complaint(folder)
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def test_gyroscope_and_accelerometer_on_topics_of_their_own(tmp_path, zeros):
 
 def test_an_imu_whose_mount_nothing_says_is_not_used(tmp_path):
     source = turning(tmp_path / "walk.bag", both)
-    with pytest.raises(SourceError, match=r"nothing says how the IMU .* record /tf_static, or add \?imu=off"):
+    with pytest.raises(SourceError, match=r"the mount of the IMU .* record /tf_static, or add \?imu=off"):
         source.imu()
 
 
@@ -139,7 +139,7 @@ def test_frames_without_a_name_are_not_the_same(tmp_path):
         for frame in room(2):
             made.depth(replace(frame, stamp_ns=START_NS + frame.stamp_ns), frame_id="")
         both(made, frame_id="")
-    with pytest.raises(SourceError, match=r"nothing says how the IMU .* is mounted"):
+    with pytest.raises(SourceError, match=r"the mount of the IMU .* is unknown"):
         open_images(tmp_path / "walk.bag").imu()
 
 

@@ -177,8 +177,8 @@ def test_a_question_mark_in_the_name_is_part_of_it(tmp_path):
     ("options", "said"),
     [
         ("depth=/camera/depth/image_rect", "no topic /camera/depth/image_rect .*did you mean '/camera/depth/image_re"),
-        ("depth=/chatter", "/chatter holds std_msgs/String, no images"),
-        ("poses=/chatter", "/chatter holds std_msgs/String, no poses"),
+        ("depth=/chatter", "/chatter holds std_msgs/String, not images"),
+        ("poses=/chatter", "/chatter holds std_msgs/String, not poses"),
         ("poses=/nowhere", "no topic /nowhere"),
         ("info=/chatter", "/chatter: 'width' is missing; name a topic"),
         ("pose=fixed&poses=/odom", "pose=fixed and poses=/odom contradict each other"),

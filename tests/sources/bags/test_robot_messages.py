@@ -145,7 +145,7 @@ def test_clouds_without_coordinates():
         read_point_cloud(short(made, fields=[made.field("x", 0, 7), made.field("y", 4, 7)]))
     with pytest.raises(ValueError, match="no fields"):
         read_point_cloud(short(made, fields=[]))
-    with pytest.raises(ValueError, match="x is of type 5, no float"):
+    with pytest.raises(ValueError, match="x is of type 5, not a float"):
         read_point_cloud(short(made, fields=[made.field(name, 0, 5) for name in "xyz"]))
 
 

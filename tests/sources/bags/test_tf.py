@@ -207,7 +207,7 @@ def test_transforms_that_are_none_are_left_out_and_counted():
     tf.add("odom", "odom", 50 * MS, STILL)
     tf.add("", "base_link", 50 * MS, STILL)
     assert x_at(tf, 50) == pytest.approx(0.5)
-    assert tf.notes == ("walk.bag /tf: 6 transforms are none and were left out",)
+    assert tf.notes == ("walk.bag /tf: 6 transforms are invalid and were left out",)
     assert tf.frames == ("base_link", "odom")
 
 

@@ -345,7 +345,7 @@ def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path):
         bag.scan(scan())
     assert sorted(os.listdir(tmp_path / "walk")) == ["metadata.yaml", "walk.mcap"]
     before = (tmp_path / "walk/walk.mcap").read_bytes()
-    with pytest.raises(SourceError, match="walk: is there and not empty; give a new folder"):
+    with pytest.raises(SourceError, match="walk: exists and is not empty; give a new folder"):
         BagWriter(tmp_path / "walk")
     assert (tmp_path / "walk/walk.mcap").read_bytes() == before
 
@@ -356,7 +356,7 @@ def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path):
         ("nowhere/walk.bag", "No such file or directory.*choose an existing folder"),
         ("nowhere/walk", "No such file or directory"),
         ("folder.bag", "is a folder; name a file"),
-        ("a#b.db3", "takes \\?, # and % in a name amiss"),
+        ("a#b.db3", "misreads \\?, # and % in a name"),
     ],
 )
 def test_places_that_cannot_be(tmp_path, name, said):

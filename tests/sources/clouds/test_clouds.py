@@ -121,7 +121,7 @@ def test_numbers_that_are_no_times_are_none(tmp_path):
     write_poses(tmp_path, [0])
     source = sv.open_source(tmp_path)
     assert source.frame(0).stamp_ns == 0
-    assert "nothing says when" in source.notes[0]
+    assert "clouds have no times" in source.notes[0]
 
 
 def test_points_that_were_seen_from_elsewhere_are_refused(folder):

@@ -187,11 +187,11 @@ def test_one_sequence_of_many_is_named_by_parameter_or_path(tmp_path):
     assert len(open_source(f"{training}?sequence=0013")) == 3
     source = open_source(training / "image_02/0000")
     assert (len(source), source.name) == (2, "kitti_tracking_0000")
-    with pytest.raises(SourceError, match=r"holds sequences 0000, 0013; say which: .*\?sequence=0000"):
+    with pytest.raises(SourceError, match=r"holds sequences 0000, 0013; choose one: .*\?sequence=0000"):
         open_source(training)
     with pytest.raises(SourceError, match=r"holds sequences 0000, 0013"):
         open_source(f"{training}?sequence=7")
-    with pytest.raises(SourceError, match=r"is a sequence already"):
+    with pytest.raises(SourceError, match=r"is already a sequence"):
         open_source(f"{training}/image_02/0000?sequence=0013")
 
 
@@ -285,7 +285,7 @@ def test_without_labels_a_note_says_what_it_means(tmp_path):
     (training / "label_02/0000.txt").unlink()
     source = open_source(training)
     assert source.boxes(0) == ()
-    assert "no object is annotated" in source.notes[0]
+    assert "objects are not annotated" in source.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -295,7 +295,7 @@ def test_without_labels_a_note_says_what_it_means(tmp_path):
         (made.raw, "../calib_cam_to_cam.txt", "P_rect_00: 1 2 3\n", "R_rect_00:' with 9"),
         (made.raw, "../calib_velo_to_cam.txt", None, "poses from oxts need it"),
         (made.raw, "../calib_imu_to_velo.txt", None, "poses from oxts need it"),
-        (made.raw, "../calib_velo_to_cam.txt", "R: 2 0 0 0 2 0 0 0 2\nT: 0 0 0\n", "R is no rotation"),
+        (made.raw, "../calib_velo_to_cam.txt", "R: 2 0 0 0 2 0 0 0 2\nT: 0 0 0\n", "R is not a rotation"),
         (made.raw, "image_00/timestamps.txt", None, "drive's own file"),
         (made.raw, "image_00/timestamps.txt", "", "holds no time"),
         (made.raw, "image_00/timestamps.txt", "yesterday\n", "timestamps.txt:1: 'yesterday' is no time"),
@@ -308,7 +308,7 @@ def test_without_labels_a_note_says_what_it_means(tmp_path):
         (made.raw, "poses_refined.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 5, "5 poses for 4 frames"),
         (made.raw, "poses_refined.txt", "", "no usable pose"),
         (made.tracking, "calib/0000.txt", None, "calibration"),
-        (made.tracking, "calib/0000.txt", "P2: " + "1 " * 12, "P2 is no projection"),
+        (made.tracking, "calib/0000.txt", "P2: " + "1 " * 12, "P2 is not a projection"),
         (made.tracking, "oxts/0000.txt", None, "?poses="),
         (made.tracking, "label_02/0000.txt", "0 1 Car 0 0 0 1 2 3 4 1.5 1.6\n", "label_02/0000.txt:1: needs 17"),
         (made.tracking, "label_02/0000.txt", "0 1 Car 0 0 0 1 2 3 4 -1 1 1 0 0 5 0\n", "label_02/0000.txt:1: needs 17"),

@@ -43,7 +43,7 @@ def test_the_unit_is_found_whatever_the_layout_usually_has(tmp_path, per_metre, 
     assert source.unit.scale == pytest.approx(1 / per_metre)
     assert source.frame(0).depth_scale == source.unit.scale
     usual = {"tum": 5000, "kitti": 1000}[layout]
-    told = [note for note in source.notes if "depth is taken to be" in note]
+    told = [note for note in source.notes if "depth is assumed to be" in note]
     assert len(told) == (per_metre != usual or not source.unit.sure)
 
 
@@ -59,7 +59,7 @@ def test_a_camera_that_only_turns_shows_no_unit_and_that_is_said(tmp_path):
     source = open_source(recording(tmp_path, 1000, poses=poses))
     assert source.depth_scale == 1 / 5000  # as the layout has it, which is wrong here
     assert not source.unit.sure
-    (note,) = [note for note in source.notes if "depth is taken to be in 1/5000 m" in note]
+    (note,) = [note for note in source.notes if "depth is assumed to be in 1/5000 m" in note]
     assert "?depth_scale=1000" in note
 
 

@@ -69,7 +69,7 @@ def test_a_damaged_image_spoils_its_own_frame_only(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"", "no .klg log"),
+        (b"", "not a .klg log"),
         (b"\3\0\0\0", "holds no whole frame"),
         (struct.pack("<iqii", 1, 0, 4, 0) + b"abcd", "the first depth image"),
         (struct.pack("<iqii", 1, 0, 12, 0) + zlib.compress(b"abcd"), "images of 2 pixels"),

@@ -124,12 +124,12 @@ def test_a_recording_without_any_depth_says_so(tmp_path):
     [
         ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE camera; undistort"),
         ({"k4": 0.1}, "k4 belongs to a fisheye"),
-        ({"fl_x": None}, "tells no fl_x"),
+        ({"fl_x": None}, "has no fl_x"),
         ({"fl_x": -3}, "fx = -0.3 must be positive"),
         ({"w": 100}, "is for 100x480 pictures, depth has 64x48"),
         ({"frames": []}, "no list of frames"),
         ({"frames": [{"depth_file_path": "../x.png"}]}, "leads out of the recording's folder"),
-        ({"frames": [{"depth_file_path": "depths/frame_00000.png", "transform_matrix": [1]}]}, "is no 4x4 matrix"),
+        ({"frames": [{"depth_file_path": "depths/frame_00000.png", "transform_matrix": [1]}]}, "is not a 4x4 matrix"),
     ],
 )
 def test_a_bad_file_is_one_line_with_its_name(tmp_path, change, said):

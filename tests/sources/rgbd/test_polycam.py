@@ -59,7 +59,7 @@ def test_an_image_without_a_camera_has_no_pose(tmp_path):
 def test_no_camera_at_all_is_one_line(tmp_path):
     for path in (polycam(tmp_path) / "keyframes/corrected_cameras").iterdir():
         path.write_text("{")
-    with pytest.raises(SourceError, match="corrected_cameras: holds no pose that can be used"):
+    with pytest.raises(SourceError, match="corrected_cameras: holds no usable pose"):
         open_source(tmp_path)
     with pytest.raises(SourceError, match=r"add \?camera=FILE"):
         open_images(tmp_path)

@@ -55,7 +55,7 @@ def test_arrays(tmp_path, shape):
     np.save(tmp_path / "p.npy", np.stack([T[:rows].reshape(shape) for T in posed()]))
     np.testing.assert_allclose(read_poses(tmp_path / "p.npy").at(2), posed()[2])
     (tmp_path / "p.npy").write_bytes((tmp_path / "p.npy").read_bytes()[:100])
-    with pytest.raises(SourceError, match="no array of poses"):
+    with pytest.raises(SourceError, match="not an array of poses"):
         read_poses(tmp_path / "p.npy")
 
 

@@ -32,7 +32,7 @@ def recording(folder, poses, true=None, per_metre=1000):
 
 
 def fit_notes(source):
-    return [note for note in source.notes if "poses do not fit" in note or "poses are all alike" in note]
+    return [note for note in source.notes if "poses do not fit" in note or "poses are all equal" in note]
 
 
 WRONG = {
@@ -83,7 +83,7 @@ def test_poses_of_another_recording_have_no_cure(tmp_path):
 def test_poses_that_stand_still_while_images_change(tmp_path):
     far = posed(12)[::5]
     (note,) = fit_notes(open_source(recording(tmp_path / "moves", [np.eye(4)] * len(far), far)))
-    assert "poses are all alike, but the images change" in note
+    assert "poses are all equal, but the images change" in note
     still = [posed()[0]] * 4
     assert fit_notes(open_source(recording(tmp_path / "stands", still, still))) == []
 
@@ -94,7 +94,7 @@ def test_millimetres_everywhere_are_not_taken_for_metres(tmp_path):
     for k, T in enumerate(posed(6)):
         write(folder / f"depth/{k}.tiff", 1000 * render(T))
         (folder / f"depth/{k}.png").unlink()
-    (note,) = (note for note in open_source(folder).notes if "depth is taken to be" in note)
+    (note,) = (note for note in open_source(folder).notes if "depth is assumed to be" in note)
     assert "beyond" in note
     assert "?depth_scale=1000&poses_scale=0.001" in note
     check(open_source(f"{folder}?depth_scale=1000&poses_scale=0.001"), posed(6), 1e6)

@@ -168,12 +168,12 @@ def test_a_damaged_image_spoils_its_own_frame_only(tmp_path):
     ("change", "said"),
     [
         ("UPDATE Data SET depth = NULL", "its 5 nodes hold no depth images"),
-        ("UPDATE Admin SET version = '0.10.4'", r"is of RTAB-Map 0\.10\.4"),
-        ("DROP TABLE Data", "no RTAB-Map database that can be read"),
-        ("UPDATE Data SET calibration = x'0102'", "a calibration that is cut off"),
+        ("UPDATE Admin SET version = '0.10.4'", r"is from RTAB-Map 0\.10\.4"),
+        ("DROP TABLE Data", "not a readable RTAB-Map database"),
+        ("UPDATE Data SET calibration = x'0102'", "a truncated calibration"),
         ("UPDATE Data SET calibration = zeroblob(44)", "a damaged calibration"),
-        ("UPDATE Admin SET opt_poses = x'01020304'", "no RTAB-Map database"),
-        ("UPDATE Node SET stamp = 'soon'", "no RTAB-Map database"),
+        ("UPDATE Admin SET opt_poses = x'01020304'", "not a readable RTAB-Map database"),
+        ("UPDATE Node SET stamp = 'soon'", "not a readable RTAB-Map database"),
     ],
 )
 def test_a_database_of_no_use_is_one_line_with_the_cure(tmp_path, change, said):

@@ -69,7 +69,7 @@ def test_images_without_a_line_have_no_pose(tmp_path):
         ("odometry.csv", HEADER, "holds no pose"),
         ("odometry.csv", HEADER + "soon, 000000, 0, 0, 0, 0, 0, 0, 1\n", r"odometry\.csv:2: 'soon'"),
         ("odometry.csv", HEADER + "1.0, 000000, 0, 0\n", r"odometry\.csv:2: "),
-        ("camera_matrix.csv", "1500, 0, 5000\n0, 1500, 700\n0, 0, 1\n", "middle of no usual picture"),
+        ("camera_matrix.csv", "1500, 0, 5000\n0, 1500, 700\n0, 0, 1\n", "not the middle of a usual picture"),
         ("camera_matrix.csv", "1500, 0, 960\n0, 1500, 1400\n0, 0, 1\n", "cy = 1400"),
     ],
 )

@@ -115,7 +115,7 @@ def test_of_several_odometry_topics_the_longest_counts_but_never_the_truth(tmp_p
 
     path = made(tmp_path / "a.bag", mounts, two, scans)
     robot = RobotBag(path)
-    assert "odometry of /best, which has most; there is /a_short_one too" in robot.notes[0]
+    assert "odometry of /best, which has the most; there is /a_short_one too" in robot.notes[0]
     assert robot.scans[1].pose_world_base[1] == pytest.approx(3.05)
     robot = RobotBag(f"{path}?truth=/best")
     assert robot.notes == ()
@@ -130,7 +130,7 @@ def test_nothing_but_depth_and_odometry(tmp_path, ending):
     assert len(robot.scans) == 0
     assert len(robot.frames) == 3
     assert (
-        "where the camera (optical) sits on the robot: taken for base_link itself; give ?camera_mount="
+        "the mount of the camera (optical) on the robot is unknown: assumed to be base_link itself; give ?camera_mount="
         in robot.notes[0]
     )
     T_optical = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # it looks forward all the same
@@ -172,9 +172,12 @@ def test_a_robot_without_tf_and_odometry_stands_still_until_its_way_is_found(tmp
     assert [scan.fault for scan in robot.scans] == [None] * 3
     np.testing.assert_array_equal(robot.scans[2].T_world_sensor, np.eye(4))
     which, still, mount = robot.notes
-    assert "scans of /front_scan, which has most; there are /a_rear_scan too: say ?scan=/topic" in which
-    assert "tells no odometry: the robot is taken to stand still until its way is found" in still
-    assert "where the lidar (front) sits on the robot: taken for base_link itself; give ?mount=x,y,z,yaw" in mount
+    assert "scans of /front_scan, which has the most; there are /a_rear_scan too: add ?scan=/topic" in which
+    assert "has no odometry: the robot is assumed to stand still until its path is found" in still
+    assert (
+        "the mount of the lidar (front) on the robot is unknown: assumed to be base_link itself; give ?mount=x,y,z,yaw"
+        in mount
+    )
     rear = RobotBag(f"{path}?scan=/a_rear_scan&mount=-0.3,0,0.2,3.14")
     assert len(rear.scans) == 2
     np.testing.assert_allclose(rear.scans[0].T_world_sensor, planar_motion(-0.3, 0, 3.14, 0.2), atol=1e-9)
@@ -268,7 +271,7 @@ def test_odometry_of_a_body_above_the_robot_s_frame(tmp_path):
 def test_odometry_of_a_body_that_nothing_connects_with_the_robot(tmp_path):
     path = made(tmp_path / "a.bag", mounts, lambda bag: wheels(bag, child="chassis"), scans)
     robot = RobotBag(path)
-    assert robot.notes == (f"{path}: /odom tells where chassis is: taken for base_link",)
+    assert robot.notes == (f"{path}: /odom has poses of chassis: assumed to be base_link",)
     np.testing.assert_allclose(robot.scans[1].pose_world_base, pose(1), atol=1e-9)
     nameless = RobotBag(made(tmp_path / "b.bag", mounts, lambda bag: wheels(bag, child=""), scans))
     assert nameless.notes == ()
@@ -280,7 +283,10 @@ def test_a_camera_in_a_tree_of_its_own_sits_where_the_robot_does(tmp_path):
         bag.tf(START_NS, "camera_link", "optical", CAMERA, "/tf_static")
 
     robot = RobotBag(made(tmp_path / "a.bag", apart, drive, images))
-    assert "where the camera (camera_link) sits on the robot: taken for base_link itself" in robot.notes[0]
+    assert (
+        "the mount of the camera (camera_link) on the robot is unknown: assumed to be base_link itself"
+        in robot.notes[0]
+    )
     assert len(robot.notes) == 1
     np.testing.assert_allclose(robot.frames[1].T_world_sensor, planar_motion(*pose(1)) @ T_BASE_CAMERA, atol=1e-9)
 
@@ -318,7 +324,7 @@ def test_other_worlds_and_robots_than_the_usual_ones_are_told(tmp_path):
         drive(bag, parent="arena", child="laser")
 
     robot = RobotBag(made(tmp_path / "a.bag", slam, scans))
-    assert "no base_footprint or base_link in /tf: laser is taken for the robot" in robot.notes[0]
+    assert "no base_footprint or base_link in /tf: laser is used as the robot" in robot.notes[0]
     assert "poses are those of laser in arena" in robot.notes[1]
     np.testing.assert_allclose(robot.scans[1].T_world_sensor, planar_motion(*pose(1)), atol=1e-9)
     np.testing.assert_array_equal(robot.scans[1].T_base_sensor, np.eye(4))
@@ -412,7 +418,7 @@ def test_depth_without_camera_info_is_told_and_only_an_error_where_it_is_asked_f
     path = made(tmp_path / "a.bag", mounts, drive, scans, lambda bag: bag.depth(2, info=False))
     robot = RobotBag(path)
     assert (len(robot.scans), len(robot.frames)) == (4, 0)
-    assert "no /camera/depth/camera_info that tells the camera" in robot.notes[0]
+    assert "no /camera/depth/camera_info with the camera" in robot.notes[0]
     assert robot.notes[0].endswith("depth images are left out")
     with pytest.raises(SourceError, match="camera_info"):
         RobotBag(f"{path}?depth=/camera/depth/image")
@@ -428,7 +434,7 @@ def test_of_several_depth_topics_the_longest_counts(tmp_path):
     path = made(tmp_path / "a.bag", mounts, drive, two)
     robot = RobotBag(path)
     assert len(robot.frames) == 3
-    assert "depth images of /b/image; there are /a/image too: say ?depth=/topic" in robot.notes[0]
+    assert "depth images of /b/image; there are /a/image too: add ?depth=/topic" in robot.notes[0]
     assert len(RobotBag(f"{path}?depth=/a/image").frames) == 2
 
 
@@ -440,7 +446,7 @@ def test_of_several_depth_topics_the_longest_counts(tmp_path):
         ("odom=/scan", r"/scan holds sensor_msgs/LaserScan; \?odom= needs nav_msgs/Odometry"),
         ("truth=/nowhere", "no topic /nowhere"),
         ("truth=/scan", "no poses"),
-        ("depth=/scan", "no images"),
+        ("depth=/scan", "not images"),
         ("base_frame=base_lnk", r"base_frame=base_lnk is in no transform \(did you mean 'base_link'\?\)"),
         ("odom_frame=odm", r"no frame 'odm' in it \(did you mean 'odom'\?\); correct \?odom_frame=odm"),
         ("mount=1,2", "mount=1,2 must be x,y,z,yaw"),
@@ -470,7 +476,7 @@ def test_bags_with_nothing_for_a_robot(tmp_path):
 def test_a_real_bag_with_two_lidars_and_no_tf():
     robot = open_robot(DEMO)
     assert (len(robot.scans), len(robot.frames), len(robot.notes)) == (331, 0, 3)
-    assert "/front_scan, which has most; there are /rear_scan too" in robot.notes[0]
+    assert "/front_scan, which has the most; there are /rear_scan too" in robot.notes[0]
     found = list(robot.scans)
     assert {scan.fault for scan in found} == {None}
     assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(found))

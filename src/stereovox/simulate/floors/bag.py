@@ -25,15 +25,15 @@ Recorded = tuple[int, Scan | Frame | se2.Pose]
 def write_bag(
     robot: Robot | Floor, path: str | os.PathLike[str], progress: Callable[[int, int], None] | None = None
 ) -> None:
-    """Write everything that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
+    """Write all recordings of a simulated robot: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
 
     Topics: /scan, /camera/depth/image_raw and its camera_info, /odom, /tf (odom -> base_link), /tf_static, and the true
-    pose in the building on /ground_truth. Depth is in millimetres, 0 for none: a bag cannot say why. progress: called
-    with messages done and in all: odometry poses, scans and images. Raises SourceError for a robot that is not of this
-    simulation and where the file cannot be written.
+    pose in the building on /ground_truth. Depth is in millimetres, 0 for none: a bag has no reasons. progress: called
+    with the done and the total number of messages: odometry poses, scans and images. Raises SourceError for robots of
+    other kinds and if the file cannot be written.
     """
     if not isinstance(robot, Floor):
-        raise SourceError(f"{robot.name}: only a simulated robot is recorded; give sim:floor")
+        raise SourceError(f"{robot.name}: only a simulated robot can be recorded; give sim:floor")
     total = len(robot.odometry) + len(robot.scans) + len(robot.frames)
     with BagWriter(path) as bag:
         _fixed(bag, robot)
@@ -57,7 +57,7 @@ def _streams(robot: Floor) -> Iterator[Iterator[Recorded]]:
 
 
 def _fixed(bag: BagWriter, robot: Floor) -> None:
-    """Write where the sensors sit; the camera's body (x forward) has its optical frame (z forward) in it."""
+    """Write the sensors' mounts; the camera's body (x forward) contains its optical frame (z forward)."""
     T_link_optical: Transform = robot.T_base_camera.copy()
     T_link_optical[:3, 3] = 0
     T_base_link = np.eye(4)

@@ -17,13 +17,13 @@ STEP_NS = 20_000_000
 TURN = 0.8
 """Fastest turn in rad/s."""
 STRAIGHT = 0.6
-"""A robot whose next stop is further to a side (radians) turns on the spot first."""
+"""A robot whose next stop is at a larger angle (radians) first turns on the spot."""
 NEAR = 0.1
 """Metres from a stop at which it counts as reached."""
 
 
 class Stop(NamedTuple):
-    """A place on the path in metres, and by how many degrees the robot turns there on the spot (left is positive)."""
+    """A place on the path in metres, and the degrees by which the robot turns there on the spot (left is positive)."""
 
     x: float
     y: float
@@ -35,7 +35,7 @@ class Odometry:
     """Errors of a robot's odometry; by default those of an uncalibrated Pioneer.
 
     distance, turn: relative errors of distances and turns; veer: radians per metre by which it seems to turn left while
-    it drives straight (wheels of unequal size). Standard deviations: distance_noise metres per metre travelled,
+    it drives straight (unequal wheels). Standard deviations: distance_noise metres per metre travelled,
     turn_noise radians per radian of turning, veer_noise radians per metre; all grow with the square root.
     """
 
@@ -47,7 +47,7 @@ class Odometry:
     veer_noise: float = 0.01
 
     def measured(self, poses: Pose, seed: int | list[int], drift: float = 1.0) -> Pose:
-        """Return the odometry's poses (N, 3) for true poses (N, 3), in the frame of the first of them.
+        """Return the odometry's poses (N, 3) for true poses (N, 3), in the frame of the first one.
 
         drift: factor on all errors.
         """
@@ -67,7 +67,7 @@ class Odometry:
 
 
 def drive(stops: Sequence[Stop], speed: float) -> Pose:
-    """Return the poses (N, 3), one each `STEP_NS`, of a robot that drives from the first stop past all others.
+    """Return the poses (N, 3), one per `STEP_NS`, of a robot that drives from the first stop past all others.
 
     It first faces the second stop. speed: m/s on straight lines.
     """
@@ -92,7 +92,8 @@ def drive(stops: Sequence[Stop], speed: float) -> Pose:
 
 
 def zigzag(start: tuple[float, float], end: tuple[float, float], aside: float, pitch: float = 1.6) -> list[Stop]:
-    """Return stops from one place to another, by turns `aside` metres to the left and the right (IST 2019, III-D)."""
+    """Return stops from one place to another, alternately `aside` metres to the left and the right (IST 2019,
+    III-D)."""
     along = np.subtract(end, start)
     length = float(np.hypot(*along))
     count = max(1, round(length / pitch))
@@ -108,7 +109,7 @@ def metres(poses: Pose) -> NDArray[np.float64]:
 
 
 def _chained(steps: Pose) -> Pose:
-    """Return the poses (N + 1, 3) that steps (N, 3) lead to from the origin."""
+    """Return the poses (N + 1, 3) after each of the steps (N, 3) from the origin."""
     yaw = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     moves = compose(np.column_stack([np.zeros((len(steps), 2)), yaw[:-1]]), steps)[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(moves, axis=0)]), wrapped(yaw)])

@@ -32,12 +32,12 @@ PLANS = {
 }
 """Functions `(shut) -> Layout`."""
 START_NS = 1_575_900_000 * 10**9
-"""When the drive begins: December 2019."""
+"""Start of the drive: December 2019."""
 ODOMETRY_HZ = 10
 BEAMS, STEP_DEG = 683, 360 / 1024
 RANGE = (0.02, 5.6)
 SCAN_DELAY_NS, FRAME_DELAY_NS = 40_000_000, 60_000_000
-"""After the odometry's pose: lidar and camera do not wait for it."""
+"""Delays after the odometry's pose: lidar and camera do not wait for it."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Options:
 
     plan: `corridors` or `testbed`. seed: of all noise. shut: the door to the stairs of `corridors` is closed. drift:
     factor on the odometry's errors; noise: 0 makes lidar and camera exact. speed: m/s. scan_hz, depth_hz: scans and
-    depth images a second (0: none). image_width: of the Kinect, in pixels. seconds: the drive ends then (0: at its last
+    depth images a second (0: none). image_width: of the Kinect, in pixels. seconds: length of the drive (0: to its last
     stop).
     """
 
@@ -76,11 +76,11 @@ class Options:
 class Floor:
     """The recording of a robot that drives through a simulated floor; see `sources.robot.Robot`.
 
-    where: `sim:floor`, or with parameters `sim:floor?plan=testbed&seed=1`; `Options` tells them. World of `truth` and
-    `plan`: the building's, z up. Poses of scans and frames are those of the odometry, which begins at 0 and drifts.
-    Everything follows from the parameters: the same `where` gives the same recording.
-    T_base_lidar, T_base_camera: (4, 4) float64, where the sensors sit (IST 2019, III-E), the camera's frame optical.
-    odometry: T_odom_base at 10 Hz. truth: T_world_base each 20 ms.
+    where: `sim:floor`, or with parameters `sim:floor?plan=testbed&seed=1`; see `Options`. World of `truth` and
+    `plan`: the building's, z up. Poses of scans and frames are the odometry's, which begins at 0 and drifts.
+    The parameters determine everything: the same `where` gives the same recording.
+    T_base_lidar, T_base_camera: (4, 4) float64, mounts of the sensors (IST 2019, III-E), the camera's frame optical.
+    odometry: T_odom_base at 10 Hz. truth: T_world_base every 20 ms.
     Raises SourceError for an unknown parameter and for values out of range.
     """
 
@@ -122,12 +122,12 @@ class Floor:
 
     @property
     def behind_door(self) -> Rectangle | None:
-        """What a shut door closes off, in the world of `truth`; None on a floor without such a door."""
+        """The area that a shut door closes off, in the world of `truth`; None on a floor without such a door."""
         return self.layout.behind_door
 
     @property
     def start(self) -> se2.Pose:
-        """Where the robot starts (3,), in the world of `truth`: there the odometry's world has its origin."""
+        """Start pose of the robot (3,), in the world of `truth`: the origin of the odometry's world."""
         return self._poses[0].copy()
 
     def true_grid(
@@ -135,14 +135,14 @@ class Floor:
     ) -> OccupancyGrid:
         """Return a perfect map of the floor between two heights (the lidar's), in the world of `truth`.
 
-        lids: with the tops and undersides that the Kinect looks at, as a 3-D map seen from above has them: a table is
-        occupied as a whole. Without them its rim is, as beams on the floor have it.
+        lids: include the tops and undersides that the Kinect sees, as in a 3-D map seen from above: a table is
+        occupied as a whole. Without them only its outline is, as beams on the floor see it.
         """
         grid = self.plan.truth(resolution, self.start[:2], heights)
         return with_lids(grid, self.plan.obstacles, heights, float(self.T_base_camera[2, 3])) if lids else grid
 
     def true_ranges(self, stamp_ns: int) -> NDArray[np.float64]:
-        """Return the exact distances (N,) in metres that the lidar's beams run, inf beyond its reach."""
+        """Return the exact ranges (N,) in metres of the lidar's beams, inf beyond its reach."""
         x, y, yaw = se2.flattened(self.truth.at(stamp_ns) @ self.T_base_lidar)
         return cast(self._at_lidar, (x, y), yaw + _angles(), RANGE[1])
 
@@ -196,7 +196,7 @@ class Floor:
         return Poses(self._stamps[::every], se2.lifted(believed[::every]), where=f"{self.name}: odometry")
 
     def _count(self, hz: float, delay_ns: int) -> int:
-        """Return how many are taken while there is odometry."""
+        """Return the number of measurements within the odometry's time span."""
         if not hz:
             return 0
         return max(0, int((self.odometry.stamps_ns[-1] - START_NS - delay_ns) * hz / 1e9) + 1)
@@ -215,5 +215,5 @@ class Floor:
 
 
 def _angles() -> NDArray[np.float64]:
-    """Return where the lidar's beams point, (N,) radians from straight ahead: 240 degrees in all."""
+    """Return the directions of the lidar's beams, (N,) radians from straight ahead: 240 degrees in all."""
     return np.radians(STEP_DEG) * (np.arange(BEAMS) - (BEAMS - 1) / 2)

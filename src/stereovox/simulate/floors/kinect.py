@@ -17,14 +17,14 @@ HFOV_DEG, VFOV_DEG = 57.0, 43.0
 BASELINE = 0.075
 """Metres from the infrared projector to the camera."""
 STEP, NOISE = 0.125, 0.0625
-"""Pixels of the full image: disparity comes in whole steps, after Gaussian noise of this standard deviation."""
+"""Pixels of the full image: disparity has discrete steps, after Gaussian noise of this standard deviation."""
 WIDTH = 640
 
 
 def kinect_camera(width: int = WIDTH) -> PinholeCamera:
     """Return the Kinect's depth camera (IST 2019, III-C), or a smaller image of the same field of view.
 
-    It declares its baseline and the noise of its disparity, quantisation included, so that a mapper knows the
+    It declares its baseline and the noise of its disparity, including quantisation, so that a mapper knows the
     uncertainty of depth.
     """
     height = round(width * 480 / WIDTH)
@@ -36,9 +36,9 @@ def kinect_camera(width: int = WIDTH) -> PinholeCamera:
 
 @dataclass(frozen=True)
 class Kinect:
-    """A depth camera that finds its own pattern of dots on the scene.
+    """A depth camera that matches its own projected pattern of dots.
 
-    step, noise: disparity comes in whole steps of so many pixels (1/8), after Gaussian noise of this standard deviation
+    step, noise: disparity has discrete steps of this many pixels (1/8), after Gaussian noise of this standard deviation
         (1/16; Khoshelham and Elberink 2012, 3.3: half a step): at 5 m a step is 7 cm of depth.
     nearest, farthest: depths in metres it delivers (IST 2019, III-C).
     edge_px, edge_loss: as in `D435`.
@@ -57,11 +57,11 @@ class Kinect:
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
-        TOO_NEAR and TOO_FAR by what it measured, UNMATCHED in shadows and next to edges.
+        TOO_NEAR and TOO_FAR by the measured depth, UNMATCHED in shadows and next to edges.
         true_depth_m: (height, width) along the optical axis, inf if there is nothing. Same seed, same image.
         """
         random = np.random.default_rng(seed)
-        # of the full image: a smaller one is a picture of it, with the same noise
+        # relative to the full image: a smaller one is a scaled copy, with the same noise
         scale = np.float32(self.camera.fx * BASELINE * WIDTH / self.camera.width)
         disparity = scale / np.asarray(true_depth_m, np.float32)
         noisy = disparity + np.float32(self.noise) * random.standard_normal(disparity.shape, np.float32)
@@ -76,5 +76,5 @@ class Kinect:
 
 
 def _in_shadow(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels the projector does not light; its beam is wider than the image."""
+    """Return the pixels that the projector does not light; its beam is wider than the image."""
     return hidden_from_right_eye(disparity) & (np.arange(disparity.shape[1]) >= disparity)

@@ -12,7 +12,7 @@ from stereovox.simulate.floors.drive import Stop, zigzag
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, Obstacle, Rectangle, block, post
 
 SHIFT = (0.0137, 0.0219)
-"""Metres by which all of a floor is moved, so that no wall lies exactly on a cell's face for any round cell size."""
+"""Offset in metres of the whole floor, so that no wall is exactly on a cell's face for any round cell size."""
 OFFICES = {"a": 7.35, "b": 11.65, "c": 15.95}
 """x at which the offices of both rows begin; they are 4.1 m wide, and all alike."""
 WIDTH = 4.1
@@ -36,7 +36,7 @@ CORNERS: tuple[Rectangle, ...] = (
 )
 """Distinctive zones (IST 2019, III-D)."""
 OPEN = ((10.25, SOUTH), (16.25, SOUTH), (11.95, NORTH))
-"""Doors of 0.9 m that stand open: x from, and the row of offices."""
+"""Open doors of 0.9 m: x from, and the row of offices."""
 SHUT = ((14.55, SOUTH), (7.65, NORTH), (16.25, NORTH))
 BEHIND: Rectangle = (1.0, 2.08, 2.8, 7.6)
 """The stairs' corridor, from the middle of its door on."""
@@ -62,7 +62,7 @@ TESTBED_STOPS = tuple(Stop(*numbers) for numbers in [
 def table(
     name: str, x: float, y: float, size: tuple[float, float] = (1.6, 0.8), turn_deg: float = 0.0
 ) -> list[Obstacle]:
-    """Return a table with its middle at (x, y): four thin legs, and a top that a low lidar does not see."""
+    """Return a table centred at (x, y): four thin legs, and a top that a low lidar does not see."""
     half_x, half_y = size[0] / 2, size[1] / 2
     about = (x, y)
     top = block("tables", f"{name}: top", _round(x, y, half_x, half_y), (0.70, 0.74), turn_deg, about)
@@ -74,7 +74,7 @@ def table(
 
 
 def chair(name: str, x: float, y: float, turn_deg: float = 0.0) -> list[Obstacle]:
-    """Return a chair with its middle at (x, y), whose sitter looks along x turned by `turn_deg`."""
+    """Return a chair centred at (x, y), whose sitter faces along x turned by `turn_deg`."""
     about = (x, y)
     seat = block("chairs", f"{name}: seat", _round(x, y, 0.21, 0.21), (0.43, 0.47), turn_deg, about)
     back = block("chairs", f"{name}: back", (x - 0.21, y - 0.2, x - 0.18, y + 0.2), (0.47, 0.88), turn_deg, about)
@@ -86,7 +86,7 @@ def chair(name: str, x: float, y: float, turn_deg: float = 0.0) -> list[Obstacle
 
 
 def shelf(name: str, where: tuple[float, float, float, float]) -> list[Obstacle]:
-    """Return a shelf on two sides, its lowest board 35 cm up: a lidar looks below it, the sides apart."""
+    """Return a shelf on two sides, its lowest board 35 cm up: a lidar sees below it, except for the sides."""
     x0, y0, x1, y1 = where
     ends = ((x0, y0, x0 + 0.03, y1), (x1 - 0.03, y0, x1, y1))
     sides = [block("shelf", f"{name}: side {n}", end, (0.0, 1.9)) for n, end in enumerate(ends, 1)]
@@ -130,7 +130,7 @@ def corridors(shut: bool) -> Layout:
 
 
 def testbed(shut: bool) -> Layout:
-    """Return the hall and a drive of about 75 m. There is no door to shut: `shut` changes nothing."""
+    """Return the hall and a drive of about 75 m. There is no door to shut: `shut` has no effect."""
     del shut
     return Layout(FloorPlan(TESTBED_FREE, _testbed_obstacles()), TESTBED_STOPS).moved(*SHIFT)
 
@@ -144,7 +144,7 @@ def _four(x: float, y: float) -> tuple[tuple[float, float], ...]:
 
 
 def _door(x: float, row: tuple[float, float], deep: float) -> Rectangle:
-    """Return the opening of a door, or the recess before a shut one."""
+    """Return the opening of a door, or the recess in front of a shut one."""
     return (x, 2.0, x + 0.9, 2.0 + deep) if row == SOUTH else (x, 7.6 - deep, x + 0.9, 7.6)
 
 
@@ -177,7 +177,7 @@ def _corner_obstacles() -> list[Obstacle]:
 
 
 def _office_obstacles() -> list[Obstacle]:
-    """Return what stands in the offices that are open: a table at the back, a chair, a cabinet away from the door."""
+    """Return the contents of the open offices: a table at the back, a chair, a cabinet away from the door."""
     obstacles = []
     for name, x, row, cabinet in (("a", 7.35, SOUTH, 0.02), ("c", 15.95, SOUTH, 3.65), ("b", 11.65, NORTH, 3.65)):
         back, towards = (row[1] - 0.45, 1) if row == SOUTH else (row[0] + 0.45, -1)

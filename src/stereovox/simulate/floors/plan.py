@@ -60,7 +60,7 @@ class FloorPlan:
 
     @cached_property
     def walls(self) -> NDArray[np.float64]:
-        """The walls' surfaces (N, 4): x, y from and to, each piece as long as it can be."""
+        """The walls' surfaces (N, 4): x, y from and to, with pieces as long as possible."""
         xs, ys, free = self._compressed
         upright_sides = _runs(np.diff(free.astype(np.int8), axis=1, prepend=0, append=0) != 0)
         level_sides = _runs(np.diff(free.astype(np.int8), axis=0, prepend=0, append=0).T != 0)
@@ -79,11 +79,12 @@ class FloorPlan:
         return np.stack([free[:, :2].min(0), free[:, 2:].max(0)])
 
     def truth(self, resolution: float, inside: ArrayLike, heights: tuple[float, float] = (0.1, 1.8)) -> OccupancyGrid:
-        """Return what a perfect map shows of the floor as seen from the place `inside` (2,).
+        """Return a perfect map of the floor as seen from the point `inside` (2,).
 
-        Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: the others
-        that can be reached from `inside`. Unknown: what is behind the surfaces; `with_lids` adds tops and undersides.
-        Cell corners lie at whole multiples of `resolution`.
+        Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: other
+        cells
+        that can be reached from `inside`. Unknown: cells behind the surfaces; `with_lids` adds tops and undersides.
+        Cell corners are at whole multiples of `resolution`.
         """
         from scipy import ndimage
 
@@ -135,7 +136,7 @@ def block(
     turn_deg: float = 0.0,
     about: tuple[float, float] | None = None,
 ) -> Obstacle:
-    """Return an upright box whose outline is a rectangle, turned to the left about a place (its middle)."""
+    """Return an upright box whose outline is a rectangle, turned to the left about a point (its centre)."""
     corners = _corners(*where)
     middle = corners.mean(0) if about is None else np.asarray(about, float)
     turn = np.radians(turn_deg)
@@ -144,7 +145,7 @@ def block(
 
 
 def post(part: str, name: str, middle: tuple[float, float], diameter: float, high: float) -> Obstacle:
-    """Return a round post that stands on the floor, with sixteen sides."""
+    """Return a round post on the floor, with sixteen sides."""
     angles = np.arange(16) * np.pi / 8
     ring = np.column_stack([np.cos(angles), np.sin(angles)]) * diameter / 2
     return Obstacle(part, name, ring + np.asarray(middle, float), 0.0, high)
@@ -168,7 +169,7 @@ def _corners(x0: float, y0: float, x1: float, y1: float) -> NDArray[np.float64]:
 
 
 def _runs(marked: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
-    """Return where marks follow each other along the first axis: from, to (behind the last) and column."""
+    """Return the runs of marks along the first axis: from, to (exclusive) and column."""
     edges = np.diff(marked.astype(np.int8), axis=0, prepend=0, append=0).T
     columns, starts = np.nonzero(edges == 1)
     _, ends = np.nonzero(edges == -1)
@@ -176,7 +177,7 @@ def _runs(marked: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
 
 
 def _sampled(segments: NDArray[np.float64], step: float) -> list[NDArray[np.float64]]:
-    """Return points (N, 2) on each segment, no further than `step` from each other."""
+    """Return points (N, 2) on each segment, at most `step` apart."""
     found = []
     for segment in segments:
         start, end = segment[:2], segment[2:]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exact views of a simulated floor by a level camera and by a lidar.
 
-For a level camera each column needs one ray on the plan, and for each obstacle the two places where that ray enters and
+For a level camera each column needs one ray on the plan, and for each obstacle the two points where that ray enters and
 leaves its outline.
 
-Lids are the tops and undersides that a camera sees: what a 3-D map has inside the outlines of obstacles. A camera lower
-than a table looks at its underside, so a 3-D map has the whole table, and so has its projection; beams in one plane
+Lids are the visible tops and undersides: a 3-D map has them inside the outlines of obstacles. A camera lower
+than a table sees its underside, so a 3-D map has the whole table, and so has its projection; beams in one plane
 find only the outline.
 """
 
@@ -29,9 +29,9 @@ NONE = np.float32(np.inf)
 def cast(
     segments: NDArray[np.float64], origin: ArrayLike, angles: ArrayLike, longest: float = np.inf
 ) -> NDArray[np.float64]:
-    """Return how far rays from `origin` (2,) run until they meet a segment, (N,) metres, inf where they meet none.
+    """Return the distance of rays from `origin` (2,) to the first segment, (N,) metres, inf if they meet none.
 
-    segments: (M, 4) x, y from and to. angles: (N,) radians, 0 along x, to the left. longest: what is farther is inf.
+    segments: (M, 4) x, y from and to. angles: (N,) radians, 0 along x, to the left. longest: larger distances are inf.
     """
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     t = cast_along(within_reach(segments, origin, longest), origin, directions)
@@ -41,7 +41,8 @@ def cast(
 def cast_along(
     segments: NDArray[np.float64], origin: ArrayLike, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf if none is."""
+    """Return the distance from `origin` (2,) to the first segment in units of `directions` (N, 2), (N,), inf if
+    none."""
     start = segments[:, :2] - np.asarray(origin, float)
     along = segments[:, 2:] - segments[:, :2]
     x, y = directions[:, :1], directions[:, 1:]
@@ -57,7 +58,7 @@ def cast_along(
 
 
 def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float) -> NDArray[np.float64]:
-    """Return the segments that touch the square of half width `reach` round `origin`, or nearly so."""
+    """Return the segments that touch, at least nearly, the square of half width `reach` round `origin`."""
     x, y = np.asarray(origin, float)
     near = (np.minimum(segments[:, 0], segments[:, 2]) <= x + reach) & (
         np.maximum(segments[:, 0], segments[:, 2]) >= x - reach
@@ -72,9 +73,9 @@ def with_lids(
 ) -> OccupancyGrid:
     """Return a perfect map of a floor with all visible lids between `heights` occupied.
 
-    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera above the floor. A lid is an
-    underside above the eye or a top below it. Not visible: lids that rest on another obstacle or carry one, and those
-    not next to a free cell. Nothing that is free in `grid` changes.
+    grid: from `FloorPlan.truth`, in the plan's frame. eye: height of the camera above the floor. A lid is an
+    underside above the eye or a top below it. Not visible: lids in contact with another obstacle, and those
+    not next to a free cell. Free cells of `grid` do not change.
     """
     from scipy import ndimage
 
@@ -94,7 +95,7 @@ def with_lids(
 
 
 def lid(obstacle: Obstacle, eye: float) -> float | None:
-    """Return the height of the underside or top that a camera at the height `eye` sees; None at the obstacle's own
+    """Return the height of the underside or top visible to a camera at the height `eye`; None at the obstacle's own
     height.
     """
     if obstacle.low > eye:
@@ -103,7 +104,7 @@ def lid(obstacle: Obstacle, eye: float) -> float | None:
 
 
 class LevelView:
-    """Depth images of one floor by one camera. height: of the camera over the floor in metres, below the ceiling."""
+    """Depth images of one floor by one camera. height: of the camera above the floor in metres, below the ceiling."""
 
     def __init__(self, plan: FloorPlan, camera: PinholeCamera, height: float):
         self._plan, self._height = plan, height
@@ -114,7 +115,8 @@ class LevelView:
         self._level = np.abs(level).astype(np.float32)
 
     def depth(self, pose_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """Return the depth (height, width) in metres; pose: (3,) x, y and where the optical axis points on the plan."""
+        """Return the depth (height, width) in metres; pose: (3,) x, y and the direction of the optical axis on the
+        plan."""
         x, y, yaw = np.asarray(pose_world_camera, float)
         ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
         directions = ahead - self._across[:, None] * left  # columns go to the right
@@ -128,11 +130,11 @@ class LevelView:
         return image
 
     def _columns(self, corners: NDArray[np.float64]) -> range:
-        """Return the columns that a body may be in, whose corners (K, 2) are given as ahead and left."""
+        """Return the columns that may show a body whose corners (K, 2) are given as ahead and left."""
         ahead, left = corners.T
         if ahead.max() <= 0:
             return range(0)
-        if ahead.min() <= 1e-3:  # next to the camera: its slopes turn over
+        if ahead.min() <= 1e-3:  # next to the camera: slopes change sign
             return range(len(self._across))
         slopes = -left / ahead
         first, last = np.searchsorted(self._across, [slopes.min(), slopes.max()])
@@ -147,7 +149,7 @@ class LevelView:
         directions: NDArray[np.float64],
         walls: NDArray[np.float32],
     ) -> None:
-        """Draw one body where it is nearer than what is there."""
+        """Draw one body if it is nearer than the current image."""
         part = slice(columns.start, columns.stop)
         enter, leave = _through(obstacle.corners, np.asarray(origin), directions[part])
         met = np.flatnonzero((enter < leave) & (enter > 0) & (enter < walls[part]))
@@ -181,12 +183,12 @@ class LevelView:
         np.minimum(image[rows], np.where(there, flat, NONE), out=image[rows])
 
     def _rows(self, slopes: list[float]) -> slice:
-        """Return the rows that look down at slopes between the least and the largest of these."""
+        """Return the rows with slopes between the smallest and the largest of these."""
         return slice(*np.searchsorted(self._down, [min(slopes) - 1e-6, max(slopes) + 1e-6]).tolist())
 
 
 def _inside(obstacle: Obstacle, grid: OccupancyGrid) -> NDArray[np.bool_]:
-    """Return which cells have their centre inside an obstacle's outline, (rows, columns)."""
+    """Return the cells whose centres are inside an obstacle's outline, (rows, columns)."""
     rows, columns = grid.cells.shape
     x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
     y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
@@ -199,9 +201,9 @@ def _inside(obstacle: Obstacle, grid: OccupancyGrid) -> NDArray[np.bool_]:
 def _through(
     corners: NDArray[np.float64], origin: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how often directions (N, 2) fit before they enter, and leave, a convex outline (K, 2).
+    """Return the distances, in units of directions (N, 2), at which rays enter and leave a convex outline (K, 2).
 
-    A ray that never does leaves before it enters.
+    A ray that misses it leaves before it enters.
     """
     along = np.roll(corners, -1, axis=0) - corners
     inward = np.column_stack([-along[:, 1], along[:, 0]])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`sim:apartment`: five rooms round a hall, with straight walls and right angles (Chien 2020, 4.4.2.1).
 
-Plan coordinates in metres: floor at 0, x east, y north. `SHIFT` moves all by odd millimetres, so that no wall lies
+Plan coordinates in metres: floor at 0, x east, y north. `SHIFT` offsets everything by odd millimetres, so that no wall
+is
 exactly on a cell's face for any round cell size.
 """
 
@@ -125,7 +126,7 @@ BOXES: dict[str, dict[str, tuple[Point, Point]]] = {
 }
 """Lowest and highest corner by part and name."""
 HEIGHT, OUTSIDE = 2.5, 0.25
-"""Of the rooms; thickness of the outer walls. Inner walls are as thick as the gaps between the rooms: 0.12 m."""
+"""Height of the rooms; thickness of the outer walls. Inner walls fill the gaps between the rooms: 0.12 m."""
 ROOMS = {
     "living room": (0.0, 0.0, 4.6, 3.2),
     "kitchen": (4.72, 0.0, 8.4, 3.2),
@@ -146,7 +147,7 @@ DOORS = {
 }
 """Door openings in the hall's walls: x from, y from, y to."""
 DOOR, LINTEL, JAMB = 0.86, 2.04, 0.05
-"""Width and height of the openings; width of the frames in them, which stand out by 2 cm on either side."""
+"""Width and height of the openings; width of the frames in them, which protrude by 2 cm on either side."""
 PASSAGE = (0.9, 1.9)
 """Opening between living room and kitchen: y from, y to."""
 
@@ -156,7 +157,8 @@ def stage(*, speed: float = 0.8) -> Stage:
 
     The path begins and ends at the same place, so that a drifting tracker revisits it. The camera sways as in a hand.
     World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture. faces: the
-    four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture stands before
+    four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture stands in front
+    of
     them. Raises SourceError for values out of range.
     """
     within("speed", speed, 0.1, 5)
@@ -172,7 +174,7 @@ def stage(*, speed: float = 0.8) -> Stage:
 
 
 def furniture() -> list[Solid]:
-    """Return all furniture, unturned boxes and round legs, chairs turned by odd angles."""
+    """Return all furniture: axis-aligned boxes, round legs, and chairs turned by odd angles."""
     boxes = [
         box(part, f"{part}: {name}", *corners) for part, things in BOXES.items() for name, corners in things.items()
     ]
@@ -188,7 +190,7 @@ def furniture() -> list[Solid]:
 
 
 def chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
-    """Return a chair whose sitter looks along +x turned by `turn` radians."""
+    """Return a chair whose sitter faces along +x turned by `turn` radians."""
 
     def part(label: str, low: Point, high: Point) -> Solid:
         (x0, y0, z0), (x1, y1, z1) = low, high
@@ -205,7 +207,7 @@ def chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
 
 
 def _sides() -> list[Face]:
-    """Return the walls as the rooms show them, in plan coordinates."""
+    """Return the visible walls of the rooms, in plan coordinates."""
     found = []
     for room, (x0, y0, x1, y1) in ROOMS.items():
         found += [

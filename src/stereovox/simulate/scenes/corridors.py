@@ -15,20 +15,20 @@ import numpy as np
 from stereovox.simulate.scene import Solid, box, cylinder
 
 HEIGHT = 2.6
-"""Of corridors."""
+"""Height of corridors."""
 THICKNESS = 0.6
-"""Of walls: niches fit into them."""
+"""Thickness of walls: niches fit into them."""
 DEEP = 0.46
-"""How far furniture stands out from a wall at most."""
+"""Largest depth of furniture in front of a wall."""
 PLAIN = 0.8
-"""Metres of bare wall at both ends of each."""
+"""Metres of bare wall at both ends of each wall."""
 BAY = (2.2, 3.4)
-"""Length of a bay, from and to."""
+"""Smallest and largest length of a bay."""
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A hole in a wall that does not go through: where it starts and ends, how high and how deep it is."""
+    """A recess in a wall: its start and end, height and depth."""
 
     start: float
     end: float
@@ -37,11 +37,11 @@ class Opening:
 
 
 Bay = tuple[Opening | None, list[Solid]]
-"""A hole in the wall, if there is one, and what stands in it or before it."""
+"""A recess in the wall, if any, and the objects in or in front of it."""
 
 
 def wall(name: str, length: float, random: np.random.Generator) -> list[Solid]:
-    """Return a wall of `length` metres, which must be 2 or more, and all that is in and before it, in its frame."""
+    """Return a wall of `length` metres, at least 2, with all objects in and in front of it, in its frame."""
     bays = max(1, round((length - 2 * PLAIN) / np.mean(BAY)))
     widths = random.uniform(*BAY, bays)
     starts = PLAIN + (length - 2 * PLAIN) * np.append(0, np.cumsum(widths)) / widths.sum()
@@ -58,7 +58,7 @@ def wall(name: str, length: float, random: np.random.Generator) -> list[Solid]:
 
 
 def _pierced(name: str, at: float, hole: Opening) -> list[Solid]:
-    """Return the wall from `at` to the end of the hole."""
+    """Return the wall from `at` to the end of the recess."""
     return [
         box("walls", f"{name}: before the opening", (at, -THICKNESS, 0), (hole.start, 0, HEIGHT)),
         box("walls", f"{name}: above the opening", (hole.start, -THICKNESS, hole.top), (hole.end, 0, HEIGHT)),
@@ -154,10 +154,10 @@ def _pipe(name: str, start: float, end: float, random: np.random.Generator) -> B
 
 
 def _place(start: float, end: float, wide: float, random: np.random.Generator) -> tuple[float, float]:
-    """Return where something begins that is so wide, or as wide as fits into the bay, and how wide it is."""
+    """Return start and width of an object in a bay, with the width limited to what fits."""
     wide = min(wide, end - start - 0.4)
     return random.uniform(start + 0.2, end - 0.2 - wide), wide
 
 
 KINDS = (_niche, _door, _pilaster, _cabinet, _shelf, _bench, _parcels, _pipe)
-"""What a bay may hold; all come before one comes again."""
+"""Possible contents of a bay; all are used before one repeats."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:hall`: a closed hall at random, with pillars, posts, half walls, boxes and lamps; every plan is another one."""
+"""`sim:hall`: a random closed hall, with pillars, posts, half walls, boxes and lamps; every plan differs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from stereovox.simulate.scene import Scene, Solid, box, cylinder
 from stereovox.simulate.stage import SHIFT, Stage, moved, within
 
 THICK, LANE = 0.2, 1.6
-"""Thickness of the walls, and width of the lane along them that is free: the way of the recording."""
+"""Thickness of the walls, and width of the free lane along them: the path of the recording."""
 EYE, HZ, IMAGE_WIDTH, SECONDS = 1.3, 15.0, 212, 40.0
 
 
 def stage(*, plan: int = 0) -> Stage:
-    """Return a hall 9 to 13 m long, 7 to 10 m wide and 2.6 to 3.4 m high, and a way round it, 15 images a second.
+    """Return a hall 9 to 13 m long, 7 to 10 m wide and 2.6 to 3.4 m high, and a path round it, 15 images a second.
 
-    plan: number of the hall: its size and what stands in it. Images are 212 pixels wide. World: z up, origin in the
+    plan: number of the hall: its size and contents. Images are 212 pixels wide. World: z up, origin in the
     middle of the floor. Parts: `walls`, `floor`, `ceiling`, `pillars`, `posts` (3 to 8 cm), `half walls`, `boxes`,
     `lamps`. Raises SourceError for values out of range.
     """
@@ -54,7 +54,7 @@ def _hall(half: np.ndarray, height: float, plan: int) -> list[Solid]:
 
 
 def _things(inner: np.ndarray, height: float, random: np.random.Generator) -> list[Solid]:
-    """Return what stands and hangs in the middle of the hall."""
+    """Return the objects in the middle of the hall."""
     solids = []
 
     def place() -> tuple[float, float]:

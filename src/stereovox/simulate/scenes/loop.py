@@ -18,13 +18,13 @@ from stereovox.simulate.walking import walk
 HALF = 1.0
 """Half width of the corridors."""
 SWAY = HALF - DEEP - 0.4
-"""By how much the walker strays from the middle: 0.4 m from all things at least."""
+"""Largest distance of the walker from the middle: at least 0.4 m from all objects."""
 LONG = 0.6
-"""Share of the ring's length that its two long sides have."""
+"""Share of the ring's length that its two long sides take."""
 STEP, BEYOND = 1.5, 2
-"""Metres from waypoint to waypoint, and how many of them the last lap goes on beyond the start."""
+"""Metres from waypoint to waypoint, and number of waypoints of the last lap beyond the start."""
 TURN_DEG = 45.0
-"""Degrees a second at corners on average."""
+"""Mean degrees a second at corners."""
 HZ, IMAGE_WIDTH = 10.0, 212
 SIDES = ("south", "east", "north", "west")
 
@@ -32,12 +32,12 @@ SIDES = ("south", "east", "north", "west")
 def stage(*, length: float = 60.0, laps: int = 2, plan: int = 0, speed: float = 1.2) -> Stage:
     """Return a rectangular ring of corridors, `length` metres round, and a walk of `laps` laps at `speed` m/s.
 
-    plan: seed of niches, doors, pilasters and furniture, of which no two are alike, and of how the walker strays from
-    the middle. The walk begins in the middle of the south side, goes anticlockwise, looks ahead and ends 3 m or less
+    plan: seed of niches, doors, pilasters and furniture, no two of which are alike, and of the walker's distance from
+    the middle. The walk begins in the middle of the south side, goes anticlockwise, faces forward and ends 3 m or less
     beyond its start. Images are 212 pixels wide, 10 a second. World: z up, corridors along x and y, 2 m wide, floor at
-    0 and the origin in the ring's middle but for odd millimetres. Parts: `walls`, `floor`, `ceiling`, `beams`, `door
+    0 and the origin in the ring's middle except for odd millimetres. Parts: `walls`, `floor`, `ceiling`, `beams`, `door
     frames`, `pilasters`, `furniture`, `things`, `boards`. faces: the walls of all sides, named `south outer` and the
-    like; niches and doors are holes in them, and things stand before them. Raises SourceError for values out of range.
+    like; niches and doors are holes in them, with objects in front of them. Raises SourceError for values out of range.
     """
     within("length", length, 30, 1000)
     within("laps", laps, 1, 100)
@@ -86,7 +86,7 @@ def _leg(size: NDArray[np.float64], leg: int) -> Transform:
 
 
 def _walls(size: NDArray[np.float64], leg: int) -> tuple[tuple[Transform, float], tuple[Transform, float]]:
-    """Return T_plan_wall and length of a side's outer and inner wall, as far as the corridor shows them."""
+    """Return T_plan_wall and length of a side's outer and inner wall, as visible from the corridor."""
     outer, inner = np.eye(4), np.diag([-1.0, -1, 1, 1])
     outer[:2, 3] = -HALF, -HALF
     inner[:2, 3] = size[leg % 2] - HALF, HALF
@@ -103,7 +103,7 @@ def _faces(size: NDArray[np.float64]) -> list[Face]:
 
 
 def _ring(size: NDArray[np.float64], random: np.random.Generator) -> list[Solid]:
-    """Return all solids; where walls meet at inner corners, both fill the corner."""
+    """Return all solids; at inner corners both walls fill the corner."""
     x, y = size / 2 + HALF + THICKNESS
     solids = [
         box("floor", "floor", (-x, -y, -THICKNESS), (x, y, 0)),
@@ -119,7 +119,7 @@ def _ring(size: NDArray[np.float64], random: np.random.Generator) -> list[Solid]
 
 
 def _beams(side: str, long: float, random: np.random.Generator) -> list[Solid]:
-    """Return beams across a side's ceiling, one in 4 m, in its frame."""
+    """Return beams across a side's ceiling, one every 4 m, in its frame."""
     count = math.ceil(long / 4)
     at = HALF + (np.arange(count) + random.random(count)) * (long - 2 * HALF - 0.4) / count
     sizes = random.uniform(0.1, 0.4, (count, 2))

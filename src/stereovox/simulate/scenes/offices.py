@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:offices`: a corridor with offices of one kind on both sides, some of which are visited again.
+"""`sim:offices`: a corridor with identical offices on both sides, some of which are visited again.
 
-An office with its half of the corridor before it is built once and stands at `office_pose` of each number. Frame of
+An office with its half of the corridor is built once and placed at `office_pose` of each number. Frame of
 an office: origin on the floor in the middle of the corridor, x through the middle of the door into the office, y left,
 z up. Even numbers are on the left of the corridor (+y), odd ones opposite.
 """
@@ -22,21 +22,21 @@ from stereovox.simulate.scenes.apartment import chair
 from stereovox.simulate.stage import SHIFT, Face, Stage, moved, rectangle, within
 
 HALF, BAY, DEEP, HEIGHT = 1.0, 3.6, 4.0, 2.6
-"""Half width of the corridor; from door to door along it; inner length of an office from its door; height of all."""
+"""Half width of the corridor; distance of doors along it; inner length of an office from its door; height of all."""
 WALL, FLOOR = 0.12, 0.2
 """Thickness of walls, and of floor and ceiling."""
 DOOR, LINTEL = 0.5, 2.05
 """Half width and height of the doors."""
 BACK = HALF + WALL + DEEP
-"""Where an office ends, in its frame."""
+"""Back of an office, in its frame."""
 SIDE = (BAY - WALL) / 2
 """Half width of an office."""
 BEFORE = 0.9
-"""Metres before a door at which the walker turns to it, and behind it has turned away."""
+"""Metres from a door at which the walker turns to it and, later, has turned away."""
 START = 0.6
-"""Where the walk begins and ends: so many metres from the corridor's end."""
+"""Start and end of the walk: metres from the corridor's end."""
 VISIT = np.array([
-    # x, y, yaw in degrees, in the office's frame; how much all three vary: metres, degrees
+    # x, y, yaw in degrees, in the office's frame; variation of the position in metres and of yaw in degrees
     [0.35, 0.0, 0, 0, 0],
     [1.06, 0.0, 0, 0, 0],  # door
     [2.10, 0.1, 50, 0.1, 10],
@@ -49,7 +49,7 @@ VISIT = np.array([
 ])  # fmt: skip
 """Into an office, once round, and out again."""
 SWAY = 0.1
-"""By how much the walker strays from the corridor's middle."""
+"""Largest distance of the walker from the corridor's middle."""
 TURN_DEG = 50.0
 HZ, IMAGE_WIDTH = 10.0, 212
 FURNITURE: dict[str, tuple[str, Point, Point]] = {
@@ -78,17 +78,18 @@ FURNITURE: dict[str, tuple[str, Point, Point]] = {
 def stage(*, offices: int = 8, visits: int = 10, walk: int = 0, speed: float = 1.0) -> Stage:
     """Return a corridor with identical `offices` on both sides, and a walk that visits some of them again.
 
-    All bays of the corridor are the same too, from either direction; only its two ends have a wall. walk: seed of which
-    offices are visited, `visits` in all, one after another at random but never the same twice running, and of small
-    differences in position and heading. Each is entered, looked round in, and left; the walk begins and ends at the
-    corridor's end, at `speed` m/s. `place` says where a pose is. Images are 212 pixels wide, 10 a second. World: z up,
-    x along the corridor from its end, origin on the floor in its middle but for odd millimetres. Parts: `walls`,
+    All bays of the corridor are also the same, from either direction; only its two ends have a wall. walk: seed of the
+    random order of `visits` visits, never to the same office twice in a row, and of small
+    differences in position and heading. In each office the walker turns once round; the walk begins and ends at the
+    corridor's end, at `speed` m/s. `place` names the place of a pose. Images are 212 pixels wide, 10 a second. World: z
+    up,
+    x along the corridor from its end, origin on the floor in its middle except for odd millimetres. Parts: `walls`,
     `floor`, `ceiling`, `door frames`, `desks`, `chairs`, `cabinets`, `shelves`, `corridor`. faces: the corridor's four
     walls; doors are holes in them. Raises SourceError for values out of range.
     """
     within("offices", offices, 2, 200)
     if offices % 2:
-        raise SourceError(f"offices={offices} must be even: they stand on both sides of the corridor")
+        raise SourceError(f"offices={offices} must be even: they are on both sides of the corridor")
     within("visits", visits, 1, 1000)
     within("walk", walk, 0, 2**31)
     within("speed", speed, 0.1, 2)
@@ -107,7 +108,7 @@ def stage(*, offices: int = 8, visits: int = 10, walk: int = 0, speed: float = 1
 
 
 def office_pose(number: int) -> Transform:
-    """Return T_world_office (4, 4); from the same pose in two offices the same is seen."""
+    """Return T_world_office (4, 4); the same pose in two offices has the same view."""
     sign = -1 if number % 2 else 1
     T = np.eye(4)
     T[:2, :2] = [[0, -sign], [sign, 0]]
@@ -117,7 +118,7 @@ def office_pose(number: int) -> Transform:
 
 
 def place(T_world_camera: Transform) -> str:
-    """Return where in the building a true pose (4, 4), world z up, is: `office 3`, or `bay 1` of the corridor.
+    """Return the place of a true pose (4, 4), world z up: `office 3`, or `bay 1` of the corridor.
 
     Doorways belong to the office.
     """
@@ -152,7 +153,7 @@ def _along(start: float, end: float, random: np.random.Generator) -> NDArray[np.
 
 
 def _visit(number: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Return waypoints (N, 3) from the corridor before a door into the office and back."""
+    """Return waypoints (N, 3) from the corridor in front of a door into the office and back."""
     x, y, yaw, metres, degrees = VISIT.T
     T_plan_office = office_pose(number)
     T_plan_office[:3, 3] -= SHIFT

@@ -17,13 +17,13 @@ FRAMES = 120
 THICKNESS = 0.2
 WALL_FRAMES = 30
 STEEPEST = 25.0
-"""Degrees by which the wall may turn; further, the camera's outermost rays hardly meet it."""
+"""Largest rotation of the wall in degrees; beyond, the camera's outermost rays hardly meet it."""
 START = 0.1
-"""Metres between the wall behind the camera and the camera."""
+"""Metres between the camera and the wall behind it."""
 STOP = 2.0
-"""Metres before the end wall at which a walking camera stops."""
+"""Metres from the end wall at which a walking camera stops."""
 FARTHEST = 16.0
-"""Depth up to which the camera delivers: Chien 2020, 2.2 trusts his D435 up to 16 m."""
+"""Maximum depth of the camera: Chien 2020, 2.2 trusts his D435 up to 16 m."""
 
 
 def box_stage(
@@ -35,11 +35,11 @@ def box_stage(
     wall: float = 4.1,
     height: float = 1.2,
 ) -> Stage:
-    """Return a box whose front is `distance` metres before the camera and parallel to the image.
+    """Return a box whose front is `distance` metres in front of the camera and parallel to the image.
 
-    x, y: where its middle is, right of and below the optical axis; wall: distance of the wall behind it; height: of the
-    camera above the floor. World: z up, origin on the floor below the camera, which looks along x. Nothing holds the
-    box, so that all its sides can be judged. Parts: `box`, `wall`, `floor`.
+    x, y: its centre, right of and below the optical axis; wall: distance of the wall behind it; height: of the
+    camera above the floor. World: z up, origin on the floor below the camera, which faces along x. The box floats,
+    so that all its sides can be evaluated. Parts: `box`, `wall`, `floor`.
     Raises SourceError for a box that does not fit between camera, wall and floor.
     """
     one_of("size", size, tuple(SIZES))
@@ -52,7 +52,7 @@ def box_stage(
         raise SourceError(f"y={y:g} puts the box into the floor or above the wall; the floor is at y={height:g}")
     low = (distance, -x - width / 2, height - y - tall / 2)
     high = (distance + deep, -x + width / 2, height - y + tall / 2)
-    half, top = 1.1 * wall + 1, height + wall  # more than the camera sees
+    half, top = 1.1 * wall + 1, height + wall  # more than the camera's view
 
     def build() -> Scene:
         return Scene(
@@ -72,10 +72,10 @@ def box_stage(
 
 
 def wall_stage(*, distance: float = 1.4, tilt: float = 0.0, turn: float = 0.0) -> Stage:
-    """Return a wall that the optical axis meets at `distance` metres, and a camera that stands.
+    """Return a wall that the optical axis meets at `distance` metres, and a static camera.
 
     tilt: degrees by which the wall's top leans away from the camera; turn: degrees by which its right side does.
-    World: z up, origin in the camera, which looks along x. Raises SourceError for values out of range.
+    World: z up, origin in the camera, which faces along x. Raises SourceError for values out of range.
     """
     within("distance", distance, 0.1, 60)
     within("tilt", tilt, -STEEPEST, STEEPEST)
@@ -98,9 +98,9 @@ def wall_stage(*, distance: float = 1.4, tilt: float = 0.0, turn: float = 0.0) -
 def aisle_stage(
     *, length: float = 12.0, width: float = 1.27, height: float = 2.5, eye: float = 1.23, speed: float = 0.0
 ) -> Stage:
-    """Return an aisle and a camera at its start that looks along it, and walks along it with `speed` m/s.
+    """Return an aisle and a camera at its start that faces along it, and moves along it at `speed` m/s.
 
-    eye: height of the camera above the floor. With speed 0 the camera stands.
+    eye: height of the camera above the floor. With speed 0 the camera is static.
     World: z up, origin on the floor below the first camera, x along the aisle, which ends at `length` - 0.1.
     Parts: `side walls`, `end wall`, `floor`, `ceiling`. Raises SourceError for values out of range.
     """

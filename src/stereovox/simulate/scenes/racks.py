@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:racks`: an aisle between shelves that are all alike, walked to and fro. x along the aisle, y to its left."""
+"""`sim:racks`: an aisle between identical shelves, walked back and forth. x along the aisle, y to its left."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ HALF, DEEP, HEIGHT = 1.2, 1.0, 3.0
 BOARDS = (0.5, 1.2, 1.9)
 """Heights of the boards."""
 SWAY, STEP, AHEAD = 0.25, 4.0, 1.0
-"""How far the walker strays from the middle, metres from waypoint to waypoint, and to the aisle's start and end."""
+"""Largest distance of the walker from the middle, metres from waypoint to waypoint, and to the aisle's ends."""
 HZ, IMAGE_WIDTH = 10.0, 212
 
 
 def stage(*, bays: int = 24, bay: float = 1.2, passes: int = 3, walk: int = 0, speed: float = 1.2) -> Stage:
     """Return an aisle of `bays` bays of `bay` metres on both sides, walked from end to end `passes` times.
 
-    Each bay has an upright, three boards and one box, at the same place: from one bay to the next the same is seen,
-    but for the hall's ends. walk: seed of how the walker strays from the middle. Images are 212 pixels wide, 10 a
+    Each bay has an upright, three boards and one box in the same place: all bays look the same,
+    except at the hall's ends. walk: seed of the walker's distance from the middle. Images are 212 pixels wide, 10 a
     second. World: z up, floor at 0. Parts: `walls`, `floor`, `ceiling`, `shelves`, `boxes`. Raises SourceError for
     values out of range.
     """
@@ -46,7 +46,7 @@ def stage(*, bays: int = 24, bay: float = 1.2, passes: int = 3, walk: int = 0, s
 
 
 def _waypoints(length: float, passes: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Return x, y and yaw in degrees (N, 3) of a walk to and fro."""
+    """Return x, y and yaw in degrees (N, 3) of a walk back and forth."""
     forth = np.arange(AHEAD, length - AHEAD, STEP)
     ways = [forth if n % 2 == 0 else forth[::-1] for n in range(passes)]
     aside = random.uniform(-SWAY, SWAY, passes * len(forth))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo's building: a furnished room with thin poles, a table and a doorway, and a long corridor behind it.
 
-Plan coordinates in metres: floor at 0, x towards the corridor, y left. `SHIFT` moves the whole building by odd
-millimetres, so that no wall lies exactly on a cell's face for any round cell size.
+Plan coordinates in metres: floor at 0, x towards the corridor, y left. `SHIFT` offsets the whole building by odd
+millimetres, so that no wall is exactly on a cell's face for any round cell size.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def _chairs() -> list[Solid]:
 
 
 def _chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
-    """Return a chair whose sitter looks along +x turned by `turn`."""
+    """Return a chair whose sitter faces along +x turned by `turn`."""
 
     def part(label: str, low: Point, high: Point) -> Solid:
         moved = [(a + x, b + y, c) for a, b, c in (low, high)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`sim:town`: streets between terraces of houses, with lamps, trees, signs, bollards and parked cars.
 
-Streets run along x and y, `PITCH` metres apart; `SHIFT` moves all by odd millimetres, so that no wall lies exactly on a
-cell's face for any round cell size.
+Streets run along x and y, `PITCH` metres apart; `SHIFT` offsets everything by odd millimetres, so that no wall is
+exactly on a cell's face for any round cell size.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ PARKED = (4.3, 1.8, 1.45)
 """Length, width and height of a car."""
 
 Way = list[tuple[float, NDArray[np.float64], float, float]]
-"""Pieces of a way: length, where it starts (2,), the heading there, and by how much it turns, in radians."""
+"""Pieces of a path: length, start (2,), heading at the start, and its turn, in radians."""
 
 
 def stage(*, blocks: int = 6, drive: int = 0, length: float = 120.0, speed: float = 5.0, town: int = 0) -> Stage:
     """Return a town of blocks x blocks blocks, 50 m each, and a drive of `length` metres at `speed` m/s.
 
-    town: seed of what stands where; drive: seed of the way, which chooses at every crossing. 10 images a second, 640
-    pixels wide, of a stereo camera with a baseline of 0.12 m that sees to 20 m. World: z up, origin in the town's
+    town: seed of the town's contents; drive: seed of the route, which chooses at every crossing. 10 images a second,
+    640
+    pixels wide, from a stereo camera with a baseline of 0.12 m and a range of 20 m. World: z up, origin in the town's
     middle. Parts: `ground`, `pavements`, `houses`, `lamps`, `trees`, `signs`, `bollards`, `cars`.
     Raises SourceError for values out of range.
     """
@@ -62,7 +63,7 @@ def stage(*, blocks: int = 6, drive: int = 0, length: float = 120.0, speed: floa
 
 
 def _way(blocks: int, length: float, random: np.random.Generator) -> Way:
-    """Return a way of at least `length` metres along the streets, which goes round the corner at crossings."""
+    """Return a path of at least `length` metres along the streets, with rounded corners at crossings."""
     place = random.integers(0, blocks + 1, 2)
     turns = np.array([0, 1, 2, 3])
     heading = int(random.choice([turn for turn in turns if _inside(place + _ahead(turn), blocks)]))
@@ -82,7 +83,7 @@ def _way(blocks: int, length: float, random: np.random.Generator) -> Way:
 
 
 def _ahead(heading: int) -> NDArray[np.int64]:
-    """Return the direction (2,) after so many quarter turns from x."""
+    """Return the direction (2,) after this many quarter turns from x."""
     return np.array([(1, 0), (0, 1), (-1, 0), (0, -1)][heading % 4])
 
 
@@ -95,7 +96,7 @@ def _crossing(place: NDArray[np.int64], blocks: int) -> NDArray[np.float64]:
 
 
 def _on_way(way: Way, travelled: float) -> Transform:
-    """Return T_world_camera after so many metres."""
+    """Return T_world_camera after this many metres."""
     ends = np.cumsum([piece[0] for piece in way])
     n = min(int(np.searchsorted(ends, travelled)), len(way) - 1)
     length, start, heading, turn = way[n]
@@ -121,7 +122,7 @@ def _town(blocks: int, seed: int) -> list[Solid]:
 
 
 def _block(name: str, low: NDArray[np.float64], random: np.random.Generator) -> list[Solid]:
-    """Return one block, whose pavement's corner nearest to -x, -y is `low` (2,)."""
+    """Return one block; `low` (2,) is the corner of its pavement nearest to -x, -y."""
     size = PITCH - 2 * ROAD
     solids = [box("pavements", f"{name}: pavement", (*low, -0.2), (*(low + size), KERB))]
     for side in range(4):
@@ -132,7 +133,7 @@ def _block(name: str, low: NDArray[np.float64], random: np.random.Generator) -> 
 def _front(name: str, size: float, random: np.random.Generator, middle: NDArray[np.float64], side: int) -> list[Solid]:
     """Return houses and street furniture along one side of a block.
 
-    They are set up as if the street ran along x, south of the block, and then turned about its middle (2,).
+    They are built as if the street ran along x, south of the block, and then turned about its middle (2,).
     """
     edge, pavement = -size / 2, STREET - ROAD
     solids = _houses(name, edge + pavement, size / 2 - pavement, random)
@@ -148,7 +149,7 @@ def _front(name: str, size: float, random: np.random.Generator, middle: NDArray[
 
 
 def _houses(name: str, edge: float, half: float, random: np.random.Generator) -> list[Solid]:
-    """Return a terrace from -half to half less the depth of the next side's, its fronts at `edge` or behind it."""
+    """Return a terrace from -half to half less the depth of the next side's, with fronts at `edge` or behind it."""
     solids, x, end = [], -half, half - 12
     for n in range(100):
         wide, back, tall = random.uniform(6, 12), random.choice([0.0, 0.0, 0.4, 1.5]), random.uniform(4, 12)

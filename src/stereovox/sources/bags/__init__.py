@@ -11,7 +11,7 @@ from stereovox.sources.bags.files import BagFile
 
 MAGIC = {b"#ROSBAG V": ".bag", b"SQLite fo": ".db3", b"\x89MCAP0\r\n\1": ".mcap"}
 FOLDER = "folder"
-"""What `suffix_of` calls a folder of rosbag2."""
+"""Result of `suffix_of` for a rosbag2 folder."""
 
 
 def suffix_of(path: str) -> str:
@@ -24,7 +24,7 @@ def suffix_of(path: str) -> str:
             from stereovox.sources.bags.folder import is_bag_folder
 
             return FOLDER if is_bag_folder(path) else ""
-        if not os.path.isfile(path):  # a named pipe would be waited for
+        if not os.path.isfile(path):  # opening a named pipe would block
             return ""
         with open(path, "rb") as file:
             start = file.read(9)

@@ -17,7 +17,7 @@ from stereovox.sources.sqlite_file import SqliteFile
 
 
 class Db3File(BagFile):
-    """A ROS 2 recording in one SQLite file, as realsense-viewer and pyrealsense2 2.57 and later write it.
+    """A ROS 2 recording in one SQLite file, as written by realsense-viewer and pyrealsense2 2.57 and later.
 
     Read with Python's own sqlite3: neither ROS nor pyrealsense2 is needed.
     """
@@ -28,9 +28,9 @@ class Db3File(BagFile):
             self._file = SqliteFile(path, ("topics", "messages"), MAX_BYTES)
             rows = self._file.rows("SELECT id, name, type FROM topics WHERE id IS NOT NULL")
             used = {row[0] for row in self._file.rows("SELECT DISTINCT topic_id FROM messages")}
-        except (sqlite3.Error, MemoryError, ValueError) as error:  # ValueError: messages that are no text
+        except (sqlite3.Error, MemoryError, ValueError) as error:  # ValueError: messages that are not text
             raise SourceError(
-                f"{path}: {one_line(error)}; no .db3 recording, or damaged: record or copy it again"
+                f"{path}: {one_line(error)}; not a .db3 recording, or damaged: record or copy it again"
             ) from None
         known = [(key, one_line(name), one_line(kind).replace("/msg/", "/")) for key, name, kind in rows if key in used]
         self._keys = {name: key for key, name, _ in known}
@@ -47,7 +47,7 @@ class Db3File(BagFile):
             key = int(self._index(topic)[1][i])
             rows = self._file.rows("SELECT data FROM messages WHERE id = ?", key)
             if len(rows) != 1 or not isinstance(rows[0][0], bytes):
-                raise ValueError("holds no message")
+                raise ValueError("has no message")
             return Wire(decompress_message(rows[0][0], MAX_BYTES), cdr=True)
         except (sqlite3.Error, SourceError, ValueError, OverflowError, MemoryError) as error:
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None

@@ -36,9 +36,9 @@ UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
 """Encodings and their usual metres per unit (REP 118); librealsense calls its own images mono16."""
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 DEPTH = ("16UC1", "32FC1")
-"""Encodings that are depth; mono16 is only in RealSense files, or where the user says so."""
+"""Encodings of depth; mono16 counts only in RealSense files, or if the user selects its topic."""
 PNG_AT = 12
-"""A compressedDepth image starts with 12 bytes about how floats were packed; the PNG follows."""
+"""A compressedDepth image starts with 12 bytes on the packing of floats; the PNG follows."""
 
 
 class DepthTopic:
@@ -76,7 +76,7 @@ class DepthTopic:
         depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
         stamp_ns, unit = picture.stamp_ns, picture.depth_units
         info = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
-        if "timestamp" in info:  # only .db3 has it: there the header counts from the start of the recording
+        if "timestamp" in info:  # only in .db3, where the header counts from the start of the recording
             stamp_ns = ns_from_ms(info["timestamp"]) or stamp_ns
         unit = unit or _positive(info.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
@@ -85,16 +85,16 @@ class DepthTopic:
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
     """Return the depth images of `topic`, or of the only topic that has any.
 
-    Raises SourceError if there is no such topic, or none or several.
+    Raises SourceError if there is no such topic, none at all, or several.
     """
     for named in filter(None, (topic, info)):
         if named not in file.types:
             raise SourceError(f"{file.path}: no topic {named} with messages{did_you_mean(named, file.types)}")
     if topic and file.types[topic] not in (IMAGE, COMPRESSED):
-        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no images; leave ?depth= out")
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, not images; leave ?depth= out")
     found = [topic] if topic else depth_topics(file)
     if len(found) > 1:
-        raise SourceError(f"{file.path}: several topics with depth, say which: ?depth={' or ?depth='.join(found)}")
+        raise SourceError(f"{file.path}: several topics with depth, choose one: ?depth={' or ?depth='.join(found)}")
     if not found:
         seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
         clouds = [f"?cloud={name}" for name, kind in sorted(file.types.items()) if kind == "sensor_msgs/PointCloud2"]
@@ -104,7 +104,7 @@ def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
 
 
 def depth_topics(file: BagFile) -> list[str]:
-    """Return the topics with depth images: RealSense's own if there are some, else by the encoding of the images."""
+    """Return the topics with depth images: RealSense's own if present, else by the encoding of the images."""
     realsense = sorted(filter(REALSENSE.fullmatch, file.types))
     found = realsense or sorted(topic for topic in file.types if _is_depth(file, topic))
     return [topic for topic in found if topic.removesuffix(f"/{PACKED}") not in set(found) - {topic}]
@@ -116,7 +116,7 @@ def first_picture(file: BagFile, topic: str, attempts: int = 3) -> Picture | Non
         try:
             return read_picture(file, topic, i, topic)
         except FrameRefused:
-            continue  # it is reported when its turn comes
+            continue  # reported when it is read
     return None
 
 
@@ -132,16 +132,16 @@ def read_picture(file: BagFile, topic: str, i: int, name: str) -> Picture:
 def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) -> tuple[NDArray[np.generic], str]:
     """Return depth (height, width) uint16 or float32, and its encoding, one of `UNITS`.
 
-    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` is used in messages. Raises
+    packed: the picture is a `CompressedImage`. size: width and height of its camera. name: used in messages. Raises
     FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
     """
     if packed:
         encoding = picture.encoding.partition(";")[0].strip()
         if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
-            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
+            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not supported; record it as 16UC1")
         return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
     if picture.encoding not in DTYPES:
-        raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
+        raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not depth; it must be 16UC1 or 32FC1")
     if (picture.width, picture.height) != size:
         found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
         raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
@@ -154,7 +154,7 @@ def find_camera(
     """Return the camera of depth `topic`, and notes. `info`: its CameraInfo topic, "" to search for one.
 
     stream, sensor: prefixes of a RealSense stream (`/device_0/sensor_0/Depth_0`) and sensor, None and "" for others.
-    Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None. Raises
+    Intrinsics: K, or P if the topic's name marks its images as rectified. Baseline: the sensor's, else None. Raises
     SourceError if there is no camera, or no valid one.
     """
     where = [info] if info else _places(topic, stream)
@@ -162,7 +162,7 @@ def find_camera(
     if found is None:
         known = sorted(name for name, kind in file.types.items() if kind == CAMERA_INFO)
         say = f"give one with ?info=/topic{f' (there are: {_few(known)})' if known else ', for example of another bag'}"
-        raise SourceError(f"{file.path}: no {where[0]} that tells the camera of {topic}; {say}")
+        raise SourceError(f"{file.path}: no {where[0]} with the camera of {topic}; {say}")
     rectified = RECTIFIED.search(topic) is not None
     try:
         message = _read(file, found)
@@ -171,12 +171,12 @@ def find_camera(
     except (FrameRefused, StereovoxError, ValueError) as error:
         raise SourceError(f"{file.path}: {found}: {error}") from None
     if any(message.D) and not rectified:
-        return camera, (f"{file.path}: {found} tells of lens distortion, which is not corrected in {topic}",)
+        return camera, (f"{file.path}: {found} has lens distortion, which is not corrected in {topic}",)
     return camera, ()
 
 
 def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
-    """Return the camera of a CameraInfo message; rectified: the images are, so that P counts and not K.
+    """Return the camera of a CameraInfo message; rectified: the images are, so P counts instead of K.
 
     Raises StereovoxError for an invalid camera.
     """
@@ -184,7 +184,7 @@ def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) 
     if rectified and info.P[0] > 0:
         fx, cx, fy, cy = info.P[0], info.P[2], info.P[5], info.P[6]
     if info.width * info.height > MAX_PIXELS:
-        raise SourceError(f"tells of {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
+        raise SourceError(f"has {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
     return PinholeCamera(info.width, info.height, fx, fy, cx, cy, baseline)
 
 
@@ -197,7 +197,7 @@ class Metadata:
         self._stamps = file.stamps(topic) if self._kind in PAIRS else np.empty(0, np.int64)
 
     def at(self, recorded_ns: int) -> dict[str, str]:
-        """Return what was recorded at that time, without values that cannot be read."""
+        """Return the pairs recorded at that time, without unreadable ones."""
         found: dict[str, str] = {}
         first, last = (int(np.searchsorted(self._stamps, recorded_ns, side)) for side in ("left", "right"))
         for i in range(first, last):
@@ -268,7 +268,7 @@ def _pixels(picture: Picture, name: str) -> NDArray[np.generic]:
         if picture.step < picture.width * dtype.itemsize:
             raise ValueError(f"a row of {picture.width} pixels does not fit into {picture.step} bytes")
         needed = (picture.height - 1) * picture.step + picture.width * dtype.itemsize
-        if needed > len(picture.data):  # of an empty buffer NumPy makes an array of whatever lies in the memory
+        if needed > len(picture.data):  # NumPy would read beyond an empty buffer
             raise ValueError(f"an image of {needed} bytes has {len(picture.data)}")
         strided = np.ndarray(shape, dtype, picture.data, strides=(picture.step, dtype.itemsize))
     except (TypeError, ValueError) as error:

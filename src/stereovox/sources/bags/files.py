@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The protocol of recordings of ROS messages: `.bag` (ROS 1), `.db3` and `.mcap` (ROS 2), and rosbag2 folders.
 
-Every message of every topic can be read by its number. Any damage ends in a one-line error, and no allocation trusts a
+Every message of every topic can be read by its number. Any damage gives a one-line error, and no allocation trusts a
 size that the file declares: reads are bounded by the size of the file, decompression by `MAX_BYTES`. Written by hand,
-because in the usual readers a hostile file sizes the buffers.
+because in the usual readers a hostile file determines the size of buffers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from stereovox.sources.bags.messages import Wire
 MAX_BYTES = 256 * 1024 * 1024
 """Largest message or chunk after decompression; anything larger is treated as damaged."""
 UNFINISHED = ".unfinished"
-"""How a folder's name ends in which a recording grows; what a killed writer leaves there can be read in an `.mcap`."""
+"""Ending of a folder with a growing recording; after a kill, its contents can be read from an `.mcap`."""
 
 
 class BagFile(Protocol):
@@ -31,7 +31,7 @@ class BagFile(Protocol):
     Attributes:
         path: The file or folder.
         types: Message type of each topic that has messages, as `sensor_msgs/Image`.
-        notes: Defects of a file that can be read all the same, one line each.
+        notes: Defects of a file that is still readable, one line each.
     """
 
     path: Path
@@ -63,18 +63,18 @@ class BagFile(Protocol):
             The serialised message.
 
         Raises:
-            FrameRefused: `unreadable`, where the file is damaged.
+            FrameRefused: `unreadable`, if the file is damaged.
         """
         ...
 
 
 def one_line(error: object) -> str:
     """Return the text of an error or name on one line, without a full stop."""
-    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(error))  # some print the arguments of an exception as they are
+    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(error))  # some print an exception's arguments as a tuple
     return " ".join(plain.split()).rstrip(".") or f"damaged ({type(error).__name__})"
 
 
 def cut_off(path: str) -> str:
-    """Return the file that a killed writer of a recording left, empty if it left none."""
+    """Return the file that a killed recorder left, empty if there is none."""
     pattern = f"{escape(path)}.*{UNFINISHED}/*/{escape(os.path.basename(path))}"
     return max(glob(pattern), default="", key=os.path.getmtime)

@@ -15,25 +15,25 @@ from stereovox.sources.bags.recording import parse_as
 
 FIX = "sensor_msgs/NavSatFix"
 RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
-"""Of the WGS 84 ellipsoid: half its long axis in metres."""
+"""WGS 84 ellipsoid: semi-major axis in metres, and flattening."""
 MAX_FIXES = 1_000_000
 
 
 @dataclass(frozen=True)
 class FixOptions:
-    """What may stand behind a bag's name: the topic of the receiver, where there are several."""
+    """Options behind a bag's name: the topic of the receiver, if there are several."""
 
     topic: str = ""
 
 
 def read_fixes(location: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return where a receiver was, in metres east, north and up of its first fix.
+    """Return the positions of a receiver, in metres east, north and up of its first fix.
 
     Args:
-        location: A bag with `sensor_msgs/NavSatFix`; where there are several topics: `drive.bag?topic=/gps/fix`.
+        location: A bag with `sensor_msgs/NavSatFix`; if there are several topics: `drive.bag?topic=/gps/fix`.
 
     Returns:
-        Times (N,) in nanoseconds, ascending, and places (N, 3). Messages without a fix or a height are left out.
+        Times (N,) in nanoseconds, ascending, and positions (N, 3). Messages without a fix or a height are left out.
 
     Raises:
         SourceError: There is no such topic, or no fix in it.
@@ -46,7 +46,7 @@ def read_fixes(location: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     if not topics:
         raise SourceError(f"{name}: holds no {FIX}; give a bag with a topic of it, or a file of positions in metres")
     if len(topics) > 1 and not topic:
-        raise SourceError(f"{name}: several receivers, say which: ?topic={' or ?topic='.join(topics)}")
+        raise SourceError(f"{name}: several receivers, choose one: ?topic={' or ?topic='.join(topics)}")
     found = dict[int, tuple[float, ...]]()
     topic = topic or topics[0]
     for i in range(min(len(file.stamps(topic)), MAX_FIXES)):
@@ -64,7 +64,7 @@ def read_fixes(location: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 def in_metres(fixes: ArrayLike) -> NDArray[np.float64]:
     """Return fixes (N, 3), degrees north, degrees east and metres above the ellipsoid, in metres east, north and up.
 
-    Of the first fix, along the axes of its horizon: by way of the earth's own axes (WGS 84, NIMA TR8350.2, 4.3).
+    Relative to the first fix and its horizon, computed through geocentric axes (WGS 84, NIMA TR8350.2, 4.3).
     """
     fixes = np.asarray(fixes, float)
     north, east = np.radians(fixes[0, :2])
@@ -78,7 +78,7 @@ def in_metres(fixes: ArrayLike) -> NDArray[np.float64]:
 
 
 def _geocentric(fixes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return fixes (N, 3) in metres from the earth's middle: towards 0 E on the equator, 90 E there, and the pole."""
+    """Return fixes (N, 3) in metres from the earth's centre: towards 0 E on the equator, 90 E there, and the pole."""
     (north, east), height = np.radians(fixes[:, :2]).T, fixes[:, 2]
     e2 = FLATTENING * (2 - FLATTENING)
     across = RADIUS / np.sqrt(1 - e2 * np.sin(north) ** 2)

@@ -19,15 +19,15 @@ from stereovox.sources.bags.messages import Wire
 
 METADATA, TITLE = "metadata.yaml", "rosbag2_bagfile_information"
 MAX_METADATA = 1024 * 1024
-"""Bytes of a metadata file; more is taken for damaged."""
+"""Bytes of a metadata file; larger ones count as damaged."""
 NUMBERED = re.compile(r".*_(\d+)\.(mcap|db3)", re.DOTALL)
 
 
 class FolderFile(BagFile):
     """A rosbag2 folder; the parts of a split recording are joined, whatever their names.
 
-    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder are used, and `notes` say
-    so. open_part: opens one of the files. Raises SourceError for files that are missing, damaged, or compressed as a
+    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder are used, with a
+    note. open_part: opens one of the files. Raises SourceError for files that are missing, damaged, or compressed as a
     whole and not readable.
     """
 
@@ -81,27 +81,27 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
         names = _numbered(folder)
         if not names:
             raise SourceError(f"{folder}: no {METADATA} in it; give the folder that rosbag2 made, or a file of it")
-        return names, (f"{folder}: no {METADATA}, as after a recording that was cut off: {_few(names)} taken",)
+        return names, (f"{folder}: no {METADATA}, as after an interrupted recording: using {_few(names)}",)
     metadata = _metadata(folder / METADATA)
     names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
-        raise SourceError(f"{folder / METADATA}: names no files; write it anew with 'ros2 bag reindex'")
-    return list(dict.fromkeys(PurePath(name).name for name in names)), ()  # older ones tell the folder as well
+        raise SourceError(f"{folder / METADATA}: names no files; write it again with 'ros2 bag reindex'")
+    return list(dict.fromkeys(PurePath(name).name for name in names)), ()  # older versions include the folder
 
 
 def _metadata(path: Path) -> dict[str, Any]:
     try:
         metadata = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
         if not isinstance(metadata, dict):
-            raise TypeError(f"{TITLE} holds nothing")
+            raise TypeError(f"{TITLE} is empty")
     except (OSError, ValueError, TypeError, KeyError) as error:
-        cure = "write it anew with 'ros2 bag reindex'"
+        cure = "write it again with 'ros2 bag reindex'"
         raise SourceError(f"{path}: {one_line(error)[:200]}; {cure}") from None
     return metadata
 
 
 def _numbered(folder: Path) -> list[str]:
-    """Return the files called `<anything>_<number>.mcap` or `.db3`, in order of the number, if all are of one name."""
+    """Return the files called `<anything>_<number>.mcap` or `.db3`, by number, if all share one name."""
     found = {}
     for path in folder.iterdir():
         match = NUMBERED.fullmatch(path.name)
@@ -112,7 +112,7 @@ def _numbered(folder: Path) -> list[str]:
 
 
 def _whole(folder: Path, name: str) -> Path:
-    """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError if it is not there."""
+    """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError if it is missing."""
     path = folder / name
     if path.suffix == ".zstd":
         if not os.path.isfile(path.with_suffix("")):
@@ -122,7 +122,7 @@ def _whole(folder: Path, name: str) -> Path:
         return path.with_suffix("")
     if not os.path.isfile(path):  # Path.is_file may raise
         raise SourceError(
-            f"{path}: is missing; copy the whole folder, or write {METADATA} anew with 'ros2 bag reindex'"
+            f"{path}: is missing; copy the whole folder, or write {METADATA} again with 'ros2 bag reindex'"
         )
     return path
 

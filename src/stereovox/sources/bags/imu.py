@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inertial measurement units in bags, and which way is up by them: at rest, and on the average, an accelerometer feels
-what holds it up."""
+"""Inertial measurement units in bags, and the up direction from them: at rest, and on average, an accelerometer
+measures the force that supports it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from stereovox.sources.imu import ImuReadings, at_times, in_order, up_of_force
 IMU = "sensor_msgs/Imu"
 NONE = (np.nan,) * 3
 REALSENSE = re.compile(r"/device_\d+/sensor_\d+/(Gyro|Accel)_\d+/imu/data")
-"""Topics of librealsense's own recordings, whose axes are those of the depth image."""
+"""Topics of librealsense's own recordings, whose axes are the depth image's."""
 OPTICAL = "optical"
-"""Part of the names of frames with optical axes (REP 103); without /tf they are taken for those of the images."""
+"""Part of the names of frames with optical axes (REP 103); without /tf they are assumed to match the images' axes."""
 MAX_READINGS = 5_000_000
-"""Of one topic: more than three hours at 400 Hz."""
+"""For one topic: more than three hours at 400 Hz."""
 SAMPLES, MIN_SAMPLES = 300, 10
-"""Messages that are read, spread over the recording, and the fewest that are enough."""
+"""Messages that are read, spread over the recording, and the required minimum."""
 
 
 class Reading(NamedTuple):
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
 
 
 def read_imu(wire: Wire) -> Reading:
-    """Return what a `sensor_msgs/Imu` says; raises ValueError if it is too short."""
+    """Return the readings of a `sensor_msgs/Imu`; raises ValueError if it is too short."""
     stamp_ns, frame_id = wire.header()
     numbers = wire.numbers("d", 4 + 9 + 3 + 9 + 3 + 1)
     rate, force = numbers[13:16], numbers[25:28]
@@ -54,18 +54,18 @@ def read_imu(wire: Wire) -> Reading:
 def read_acceleration(wire: Wire) -> tuple[int, str, NDArray[np.float64]]:
     """Return time in nanoseconds, frame and acceleration (3,) in m/s^2 of a `sensor_msgs/Imu`.
 
-    Raises ValueError if it is too short, not finite, or says that it has no acceleration.
+    Raises ValueError if it is too short, not finite, or marked as having no acceleration.
     """
     found = read_imu(wire)
     if not np.isfinite(found.force).all():
-        raise ValueError("tells no acceleration")
+        raise ValueError("has no acceleration")
     return found.stamp_ns, found.frame_id, np.array(found.force)
 
 
 def up_by_gravity(file: BagFile, tf: Tf, world: str) -> NDArray[np.float64] | None:
     """Return the unit vector (3,) that points up in `world`.
 
-    None if no IMU's frame is connected with it by /tf, or the mean of the accelerations is not that of gravity.
+    None if no IMU's frame is connected with it by /tf, or the mean acceleration is not gravity.
     """
     for topic in sorted(topic for topic, kind in file.types.items() if kind == IMU):
         found = []
@@ -93,7 +93,7 @@ class Topic(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """Whether angular rates were measured: RealSense's topics of accelerations have zeros alone."""
+        """Whether angular rates were measured: RealSense's acceleration topics contain only zeros."""
         return bool(np.nan_to_num(self.rate).any())
 
     @property
@@ -103,19 +103,19 @@ class Topic(NamedTuple):
 
 
 def read_readings(file: BagFile, tf: Tf | None, frame_id: str, topic: str = "") -> ImuReadings | None:
-    """Return the readings of the IMU in a bag; None if missing.
+    """Return the readings of the IMU in a bag; None if it has none.
 
-    Where one topic has angular rates and another accelerations (RealSense: gyro and accel), these are put at the times
-    of those.
+    If one topic has angular rates and another accelerations (RealSense: gyro and accel), the latter are interpolated to
+    the times of the former.
 
     Args:
         file: The bag.
-        tf: Its transforms, which say how the IMU is mounted.
+        tf: Its transforms, for the mount of the IMU.
         frame_id: Frame of the images.
         topic: Topic of the IMU, "" for the only one with angular rates.
 
     Raises:
-        SourceError: There are several, no such topic, or none whose mount is known.
+        SourceError: There are several IMUs, no such topic, or none with a known mount.
     """
     names = sorted(name for name, kind in file.types.items() if kind == IMU)
     if topic and topic not in names:
@@ -123,7 +123,7 @@ def read_readings(file: BagFile, tf: Tf | None, frame_id: str, topic: str = "") 
     found = {name: _topic(file, name) for name in names}
     turning = [name for name in ([topic] if topic else names) if found[name].turns]
     if len(turning) > 1:
-        raise SourceError(f"{file.path}: several IMUs, say which: ?imu={' or ?imu='.join(turning)}")
+        raise SourceError(f"{file.path}: several IMUs, choose one: ?imu={' or ?imu='.join(turning)}")
     if not turning:
         return None
     gyro = found[turning[0]]
@@ -153,7 +153,7 @@ def _topic(file: BagFile, name: str) -> Topic:
 
 
 def _nearest_name(name: str, others: list[str]) -> str:
-    """Return the topic that begins most like another one: that of the same camera."""
+    """Return the topic with the longest common path: the one of the same camera."""
     return max(others, key=lambda other: len(os.path.commonpath([f"/{name}", f"/{other}"])))
 
 
@@ -165,7 +165,7 @@ def _at(accel: Topic, wanted_ns: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _mount(file: BagFile, tf: Tf | None, frame_id: str, name: str, gyro: Topic) -> Transform:
-    """Return T_images_imu (4, 4): of /tf, else the identity where both have optical axes."""
+    """Return T_images_imu (4, 4): from /tf, else the identity if both have optical axes."""
     if tf is not None and frame_id and gyro.frame_id:
         try:
             return tf.lookup(frame_id, gyro.frame_id, int(gyro.stamps_ns[len(gyro.stamps_ns) // 2]))
@@ -174,5 +174,5 @@ def _mount(file: BagFile, tf: Tf | None, frame_id: str, name: str, gyro: Topic) 
     same = gyro.frame_id != "" and gyro.frame_id == frame_id
     if REALSENSE.fullmatch(name) or same or OPTICAL in gyro.frame_id:
         return np.eye(4)
-    said = f"nothing says how the IMU of {name} ('{gyro.frame_id}') is mounted on the camera ('{frame_id}')"
+    said = f"the mount of the IMU of {name} ('{gyro.frame_id}') on the camera ('{frame_id}') is unknown"
     raise SourceError(f"{file.path}: {said}; record /tf_static, or add ?imu=off")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in one `.mcap` file (mcap.dev/spec): read by the index, or by scanning a file that has none."""
+"""Recordings in one `.mcap` file (mcap.dev/spec): read by the index, or by scanning a file without one."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ MIN_CHUNK_BYTES = HEAD + 40
 """Bytes of an empty chunk."""
 ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 ENCODINGS = {"cdr": True, "ros1": False}
-"""Supported message encodings, and whether each is that of ROS 2; others (JSON, protobuf) do not come from ROS."""
+"""Supported message encodings, and whether each is ROS 2's; others (JSON, protobuf) are not ROS messages."""
 TAIL = HEAD + 20 + len(START)
 """Bytes of the last record and of the magic that ends a file."""
 NO_CHUNK = -1
-"""Stands for the chunk of a message that is in none."""
+"""Chunk of a message outside all chunks."""
 MAX_RECORDS = 10_000_000
 """Most records that a scan accepts: hours of a robot, and 240 MB of memory if all are messages."""
 MAX_STAMP_NS = 2**63 - 1
@@ -51,8 +51,8 @@ CHUNKS = 4
 class McapFile(BagFile):
     """A recording of ROS 2, or of ROS 1 converted to `.mcap`: chunks uncompressed or with zstd or lz4.
 
-    Read by the index at its end. Where that is missing, as after an interrupted recording, or unusable, the file is
-    scanned once when it is opened, and what is intact counts; `notes` then say so. Raises SourceError for a file
+    Read by the index at its end. If that is missing, as after an interrupted recording, or unusable, the file is
+    scanned once when it is opened, its intact messages count, and `notes` report it. Raises SourceError for a file
     without anything readable.
     """
 
@@ -87,7 +87,7 @@ class McapFile(BagFile):
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
     def _scan(self, why: str) -> ScannedFile:
-        """Scan the file and note what was found."""
+        """Scan the file and note the result."""
         found = ScannedFile(self._bytes)
         if not found.complete and not found.channels:
             raise SourceError(f"{self.path}: cut off or damaged before the first message; record or copy it again")
@@ -97,11 +97,11 @@ class McapFile(BagFile):
             else f"; cut off or damaged at byte {found.whole} of {self._bytes.size}, the rest is lost"
         )
         lost = f"; {found.damaged} damaged chunks left out" if found.damaged else ""
-        self.notes = (f"{self.path}: {one_line(why)}: gone through from the beginning{lost}{rest}",)
+        self.notes = (f"{self.path}: {one_line(why)}: scanned from the beginning{lost}{rest}",)
         return found
 
     def _of(self, topic: str) -> Places:
-        """Return where the messages of a topic are, in time order."""
+        """Return the positions of a topic's messages, in time order."""
         if topic not in self._places:
             try:
                 places = self._index.places(topic)
@@ -142,7 +142,7 @@ class Summary:
         self.channels = {key: known for key, known in self.channels.items() if key in counted}
 
     def places(self, topic: str) -> Places:
-        """Return where the messages of `topic` are; raises ValueError for a damaged index."""
+        """Return the positions of the messages of `topic`; raises ValueError for a damaged index."""
         parts = [np.empty((0, 3), np.int64)]
         for channel in (key for key, known in self.channels.items() if known.topic == topic):
             parts.extend(self._in_chunk(chunk, channel) for chunk in self._chunks if chunk.counts.get(channel))
@@ -163,7 +163,7 @@ class Summary:
                     self.channels[number] = channel
             elif found.kind == CHUNK_INDEX:
                 chunk = read_chunk_index(wire)
-                if not end <= chunk.start < chunk.end <= limit:  # one after the other, as they were written
+                if not end <= chunk.start < chunk.end <= limit:  # in the order in which they were written
                     raise ValueError("the index is damaged")
                 self._chunks.append(chunk)
                 end = chunk.end
@@ -185,7 +185,7 @@ class Summary:
 class ScannedFile:
     """The messages found by scanning a file from its beginning, as far as it is intact.
 
-    whole: intact bytes; complete: whether the file ends there as it should; damaged: chunks skipped. Raises SourceError
+    whole: intact bytes; complete: whether the file ends properly there; damaged: chunks skipped. Raises SourceError
     for more records than memory allows, MissingExtra if chunks cannot be decompressed.
     """
 
@@ -199,7 +199,7 @@ class ScannedFile:
         self.channels = {key: known for key, known in self.channels.items() if key in self._found}
 
     def places(self, topic: str) -> Places:
-        """Return where the messages of `topic` are."""
+        """Return the positions of the messages of `topic`."""
         keys = [key for key, known in self.channels.items() if known.topic == topic]
         return np.concatenate([np.frombuffer(self._found[key], np.int64).reshape(-1, 3) for key in keys])
 
@@ -266,13 +266,13 @@ class ScannedFile:
         if number not in self.channels:
             return
         if time > MAX_STAMP_NS:
-            raise ValueError("a time that cannot be")
+            raise ValueError("an impossible time")
         place = found.start - HEAD
         self._found.setdefault(number, array("q")).extend((time, chunk.start - HEAD if chunk else NO_CHUNK, place))
 
 
 class Record(NamedTuple):
-    """Where a record's fields are, in a file or a decompressed chunk."""
+    """The position of a record's fields, in a file or a decompressed chunk."""
 
     kind: int
     start: int
@@ -288,7 +288,7 @@ class Channel(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk according to the index: counts of its messages and places of their indexes, by channel."""
+    """A chunk according to the index: counts of its messages and positions of their indexes, by channel."""
 
     start: int
     end: int
@@ -297,7 +297,7 @@ class Chunk(NamedTuple):
 
 
 class McapBytes:
-    """Bounded reads of a file: never more bytes, or more memory, than it has; it is not kept open."""
+    """Bounded reads of a file: never more bytes, or more memory, than it has; the file is not kept open."""
 
     def __init__(self, path: Path):
         self.path, self.size = path, path.stat().st_size
@@ -307,7 +307,7 @@ class McapBytes:
         if not 0 <= start <= end <= self.size:
             raise ValueError("the file is cut off")
         if end - start > MAX_BYTES:
-            raise ValueError("tells of an absurd size")
+            raise ValueError("declares an absurd size")
         with self.path.open("rb") as file:
             file.seek(start)
             data = file.read(end - start)
@@ -316,7 +316,7 @@ class McapBytes:
         return data
 
     def record(self, start: int) -> Record:
-        """Return the record at `start`; raises ValueError if the file ends before it does."""
+        """Return the record at `start`; raises ValueError if the file ends inside it."""
         return record(self.at(start, min(start + HEAD, self.size)), start, self.size)
 
     def fields(self, found: Record, kind: int) -> Wire:
@@ -340,14 +340,14 @@ class McapBytes:
 
 
 def record(head: bytes, start: int, limit: int) -> Record:
-    """Return the record that starts with `head` at `start`; raises ValueError for none that ends within `limit`."""
+    """Return the record that starts with `head` at `start`; raises ValueError if it does not end within `limit`."""
     if len(head) < HEAD:
         raise ValueError("the file is cut off")
     end = start + HEAD + int.from_bytes(head[1:HEAD], "little")
     if end > limit:
         raise ValueError("the file is cut off")
     if head[0] == 0:
-        raise ValueError("no record where one should be")
+        raise ValueError("a record is missing")
     return Record(head[0], start + HEAD, end)
 
 
@@ -366,7 +366,7 @@ def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | No
 
 
 def read_chunk_index(wire: Wire) -> Chunk:
-    """Return where a chunk and the indexes of its messages are; raises ValueError for impossible places."""
+    """Return the positions of a chunk and of the indexes of its messages; raises ValueError for impossible ones."""
     _, _, start, length = wire.numbers("Q", 4)
     if length < MIN_CHUNK_BYTES:
         raise ValueError("the index is damaged")
@@ -383,7 +383,7 @@ def read_chunk_index(wire: Wire) -> Chunk:
 
 
 def read_message_index(wire: Wire, channel: int) -> NDArray[np.void]:
-    """Return the (N,) times and places within their chunk of a channel's messages."""
+    """Return the (N,) times and positions within their chunk of a channel's messages."""
     if wire.number("H") != channel:
         raise ValueError("the index points to something else")
     return np.frombuffer(wire.data(), ENTRY)
@@ -392,7 +392,7 @@ def read_message_index(wire: Wire, channel: int) -> NDArray[np.void]:
 def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
     """Return channel, time and serialised data of the message at `start` of a decompressed chunk."""
     if start < 0:
-        raise ValueError("the index points to nowhere")
+        raise ValueError("the index points outside the chunk")
     found = record(data[start : start + HEAD], start, len(data))
     wire = Wire(memoryview(data)[found.start : found.end], cdr=False)
     if found.kind != MESSAGE:

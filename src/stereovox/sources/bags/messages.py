@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few ROS messages needed for depth images and poses, parsed from their bytes: ROS 1 and ROS 2 (CDR) alike.
+"""The few ROS messages needed for depth images and poses, parsed from their bytes, for both ROS 1 and ROS 2 (CDR).
 
 Written by hand, because librealsense's ROS 1 images are longer than their own definition (a float with the depth unit
-follows where the header's frame_id is "1"), which general readers refuse, and because no allocation here trusts a
+follows if the header's frame_id is "1"), which general readers refuse, and because no allocation here trusts a
 declared length.
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 STAMP_LIMIT = 2**63
 MAX_COEFFICIENTS = 64
-"""Of a lens; the longest model in use has 14."""
+"""Most coefficients of a lens; the longest model in use has 14."""
 STAMPED = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
 WITH_CHILD = ("TransformStamped", "Odometry")
 POSE_TYPES = frozenset({"geometry_msgs/Transform", "nav_msgs/Odometry"} | {f"geometry_msgs/{n}" for n in STAMPED[:3]})
@@ -56,20 +56,20 @@ class Wire:
     def array(self, code: str, count: int) -> NDArray[np.generic]:
         """Return `count` numbers of the NumPy type `code` (`f4`) as an array (count,) in the machine's byte order."""
         dtype = np.dtype(code)
-        if self._cdr and count:  # aligned only where something follows
+        if self._cdr and count:  # aligned only if something follows
             self._at += -(self._at - self._start) % dtype.itemsize
         stored = np.frombuffer(self.block(dtype.itemsize * count), dtype.newbyteorder(self._order))
         return stored.astype(dtype)
 
     def block(self, size: int) -> memoryview:
-        """Return the next `size` bytes, not copied."""
+        """Return the next `size` bytes without a copy."""
         if size > self.left:
-            raise ValueError(f"{size} bytes are announced where {max(self.left, 0)} are left")
+            raise ValueError(f"{size} bytes are announced, but {max(self.left, 0)} are left")
         self._at += size
         return self._view[self._at - size : self._at]
 
     def data(self) -> memoryview:
-        """Return the bytes of a `uint8[]`, not copied."""
+        """Return the bytes of a `uint8[]` without a copy."""
         return self.block(self.number())
 
     def text(self) -> str:
@@ -101,7 +101,7 @@ class Picture:
 
 
 def read_image(wire: Wire) -> Picture:
-    """Return a `sensor_msgs/Image`, with librealsense's depth unit in metres where one follows."""
+    """Return a `sensor_msgs/Image`, with librealsense's depth unit in metres if one follows."""
     stamp_ns, frame_id = wire.header()
     height, width = wire.numbers("I", 2)
     encoding, big_endian, step, data = wire.text(), wire.number("B"), wire.number(), wire.data()
@@ -110,7 +110,7 @@ def read_image(wire: Wire) -> Picture:
 
 
 def read_compressed(wire: Wire) -> Picture:
-    """Return a `sensor_msgs/CompressedImage`; its format stands in `encoding`."""
+    """Return a `sensor_msgs/CompressedImage`; its format is stored in `encoding`."""
     stamp_ns, frame_id = wire.header()
     return Picture(stamp_ns, frame_id, wire.text(), wire.data())
 
@@ -134,14 +134,14 @@ def read_camera_info(wire: Wire) -> CameraInfo:
     count = wire.number()
     if count > MAX_COEFFICIENTS:
         raise ValueError(f"a lens with {count} coefficients")
-    D = wire.numbers("d", count) if count else ()  # aligned only where something follows
+    D = wire.numbers("d", count) if count else ()  # aligned only if something follows
     K, _, P = wire.numbers("d", 9), wire.numbers("d", 9), wire.numbers("d", 12)
     return CameraInfo(width, height, K, D, P)
 
 
 @dataclass(frozen=True)
 class StampedPose:
-    """A pose: tx ty tz in metres, quaternion qx qy qz qw; time and frame names where the message has them."""
+    """A pose: tx ty tz in metres, quaternion qx qy qz qw; time and frame names if the message has them."""
 
     numbers: tuple[float, ...]
     stamp_ns: int | None = None
@@ -149,7 +149,7 @@ class StampedPose:
 
 
 def read_pose(wire: Wire, kind: str) -> StampedPose:
-    """Return the pose in a message of one of the `POSE_TYPES`; covariance and speed are left."""
+    """Return the pose in a message of one of the `POSE_TYPES`, without covariance and speed."""
     name = kind.rpartition("/")[2]
     stamp_ns = wire.header()[0] if name in STAMPED else None
     child = wire.text() if name in WITH_CHILD else ""
@@ -170,9 +170,9 @@ def read_value(wire: Wire, kind: str) -> float:
 
 
 def ns_from_ms(text: str) -> int | None:
-    """Return the nanoseconds of a decimal number of milliseconds; None for what is none or too large for int64."""
+    """Return the nanoseconds of a decimal number of milliseconds; None if it is invalid or too large for int64."""
     try:
         number = Decimal(text) * 1_000_000
-    except ArithmeticError:  # those of Decimal
+    except ArithmeticError:  # raised by Decimal
         return None
     return round(number) if number.is_finite() and abs(number) < STAMP_LIMIT else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures in a recording that were taken with its depth images, by the same camera or one mounted next to it."""
+"""Pictures in a recording taken with its depth images, by the same camera or one mounted next to it."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "mono8": 1,
 INFRARED = re.compile(r"infra|(?<![a-z])ir(?![a-z])")
 """Topics of infrared images, which show the projected pattern: it moves with the camera."""
 WITHIN_NS, RECORDED_NS = 20_000_000, 200_000_000
-"""How far a picture may be from its depth image by their own times, and by those at which they were recorded."""
+"""Largest distance between a picture and its depth image by their own times, and by recording times."""
 
 
 class PhotoTopic:
     """Pictures of one topic.
 
     Attributes:
-        camera: Their camera, without distortion: what is distorted is undistorted.
-        T_depth_photo: (4, 4), maps its optical frame into that of the depth camera.
+        camera: Their camera after undistortion.
+        T_depth_photo: (4, 4), maps its optical frame into the depth camera's.
     """
 
     def __init__(self, file: BagFile, topic: str, T_depth_photo: Transform):
@@ -55,9 +55,9 @@ class PhotoTopic:
         self._file, self._topic, self._stamps = file, topic, file.stamps(topic)
 
     def near(self, recorded_ns: int, stamp_ns: int) -> Photo | None:
-        """Return the picture that was recorded nearest to a depth image, None if none is near.
+        """Return the picture recorded nearest to a depth image, None if none is near.
 
-        Its `pixels` raise FrameRefused if its own time is not near `stamp_ns`, that of the depth image.
+        Its `pixels` raise FrameRefused if its own time is not near `stamp_ns`, the depth image's.
         """
         after = int(np.searchsorted(self._stamps, recorded_ns))
         around = [k for k in (after - 1, after) if 0 <= k < len(self._stamps)]
@@ -76,11 +76,11 @@ class PhotoTopic:
 
 
 def find_photos(file: BagFile, depth: DepthTopic, transforms: Callable[[], Tf | None]) -> PhotoTopic | None:
-    """Return the pictures to which depth images are registered, else those of a camera that is fixed next to theirs.
+    """Return the pictures that depth images are registered to, else those of a camera mounted next to theirs.
 
-    None if there are no pictures whose camera and place are known. Infrared images are left out.
+    None if there are no pictures with a known camera and mount. Infrared images are left out.
 
-    transforms: reads those of the recording; called where they are needed.
+    transforms: reads the transforms of the recording; called only if needed.
     """
     if not depth.frame_id:
         return None
@@ -118,7 +118,7 @@ def pixels_of(picture: Picture, size: tuple[int, int], name: str) -> NDArray[np.
 
 
 def _is_photo(file: BagFile, topic: str) -> bool:
-    """Return whether a topic holds pictures whose camera is reported next to them."""
+    """Return whether a topic holds pictures with a CameraInfo next to them."""
     info = sibling(topic.removesuffix("/compressed"), "camera_info")
     if file.types[topic] not in (IMAGE, COMPRESSED) or INFRARED.search(topic) or file.types.get(info) != CAMERA_INFO:
         return False

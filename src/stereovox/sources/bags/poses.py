@@ -18,15 +18,15 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import transforms
 
 T265 = re.compile(r"(/device_\d+/sensor_\d+/Pose_\d+/pose)/transform/data")
-"""A geometry_msgs/Transform without a time: that is in the metadata, with the confidence."""
+"""A geometry_msgs/Transform without a time, which is in the metadata, with the confidence."""
 CURE = "put poses next to it in a camera pair (pair.toml), or add ?pose=fixed for a camera that stood still"
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Poses as the file has them, in its axes; None, and the reason in one line, if there are none.
+    """Poses as in the file, in its axes; None, and the reason in one line, if there are none.
 
-    tracker: they are a T265's, in OpenGL axes; of_camera: the messages say that they are those of the depth camera;
+    tracker: they are a T265's, in OpenGL axes; of_camera: the messages identify them as the depth camera's;
     assumed: else, what is assumed about them.
     """
 
@@ -41,7 +41,7 @@ def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: 
     """Return the poses of `topic`, else the camera's according to /tf, else those of the only topic that has any.
 
     frame_id: frame of the depth images, "" to skip /tf. world_frame: see `tf.tf_poses`. Raises SourceError if the
-    named topic does not exist or has no poses, and where /tf does not know `world_frame`.
+    named topic does not exist or has no poses, and if `world_frame` is not in /tf.
     """
     if topic:
         return topic_poses(file, topic, frame_id)
@@ -50,9 +50,9 @@ def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: 
         by_tf, why = _from_tf(file, frame_id, world_frame)
     if by_tf:
         others = f"; ?poses={' or ?poses='.join(found)} for others" if found else ""
-        return FoundPoses(by_tf, assumed=f"{by_tf.where}: these poses count{others}")
+        return FoundPoses(by_tf, assumed=f"{by_tf.where}: these poses are used{others}")
     if len(found) > 1:
-        say = f"several topics with poses, say which: ?poses={' or ?poses='.join(found)}"
+        say = f"several topics with poses, choose one: ?poses={' or ?poses='.join(found)}"
         return FoundPoses(None, f"{file.path}: {say}")
     if not found:
         return FoundPoses(None, f"{why or f'{file.path}: holds no poses'}; {CURE}")
@@ -64,7 +64,9 @@ def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in POSE_TYPES:
-        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_supported_types()}")
+        raise SourceError(
+            f"{file.path}: {topic} holds {file.types[topic]}, not poses; name one of {_supported_types()}"
+        )
     return _read(file, topic, frame_id)
 
 
@@ -81,7 +83,7 @@ def _from_tf(file: BagFile, frame_id: str, world_frame: str) -> tuple[TfPoses | 
 
 
 def pose_topics(file: BagFile) -> list[str]:
-    """Return the topics with poses, without those that say how a RealSense's own sensors are mounted."""
+    """Return the topics with poses, without mounts of a RealSense's own sensors."""
     loose = "geometry_msgs/Transform"
     return sorted(t for t, kind in file.types.items() if kind in POSE_TYPES and (kind != loose or T265.fullmatch(t)))
 
@@ -94,7 +96,7 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
         try:
             pose = read_pose(file.read(topic, i), kind)
         except (FrameRefused, ValueError):
-            continue  # images near it find no pose near enough
+            continue  # images near it will have no pose
         values = metadata.at(int(recorded[i])) if metadata else {}
         stamps.append(_stamp(pose, values, int(recorded[i])))
         numbers.append(pose.numbers)
@@ -102,14 +104,16 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
         child = child or pose.child
     where = f"{file.path} {topic}"
     if not stamps:
-        return FoundPoses(None, f"{where}: not one pose can be read; {CURE}")
+        return FoundPoses(None, f"{where}: no pose can be read; {CURE}")
     rows = np.array(numbers)
     faults = _mark_unusable(rows, stamps, where)
     trusted = np.array(confidence) if np.isfinite(confidence).any() else None
     with np.errstate(invalid="ignore"):
         poses = Poses(stamps, transforms(rows), trusted, where=where, faults=faults)
     what = "T265 body, as if it were the depth camera" if match else "depth camera's optical frame"
-    assumed = f"{where}: taken for poses of the {what}; set ?axes=, or make a camera pair (pair.toml), if they are not"
+    assumed = (
+        f"{where}: assumed to be poses of the {what}; set ?axes=, or make a camera pair (pair.toml), if they are not"
+    )
     return FoundPoses(poses, "", bool(match), bool(child) and child.strip("/") == frame_id.strip("/"), assumed)
 
 
@@ -128,7 +132,7 @@ def _confidence(text: str) -> float:
 
 
 def _mark_unusable(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
-    """Replace invalid poses by NaN, and return by stamp what is wrong with them."""
+    """Replace invalid poses by NaN, and return the reasons by stamp."""
     bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
     rows[bad] = np.nan
     return {stamps[k]: f"{where}: message {k} holds no pose; leave the images near it out" for k in np.flatnonzero(bad)}

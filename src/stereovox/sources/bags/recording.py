@@ -34,17 +34,17 @@ OptionsT = TypeVar("OptionsT")
 
 @dataclass(frozen=True)
 class Options:
-    """What may stand behind the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
+    """Options behind the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
 
-    depth, info, poses: topics of the depth images, of their `sensor_msgs/CameraInfo`, and of the camera's poses, where
-        they are not found or not the right ones.
+    depth, info, poses: topics of the depth images, of their `sensor_msgs/CameraInfo`, and of the camera's poses, if
+        they are not found or the wrong ones are.
     axes: axes of the posed body, `optical`, `ros` (x forward, z up) or `opengl` (T265); world: axes of the map, `file`,
-        `up` or `optical` (see `tracker.py`). T265 poses are `opengl` and `up` if nothing else is said, others `optical`
+        `up` or `optical` (see `tracker.py`). Defaults: `opengl` and `up` for T265 poses, else `optical`
         and `file`.
-    world_frame: the frame of /tf that is the world: `map`, else `odom`, else the root of the tree if nothing is said.
-    pose: `fixed` for a camera that stood still: every pose is the identity, poses in the file do not count.
-    imu: topic of the IMU (`sensor_msgs/Imu`), where there are several; `off` for none.
-    scale: metres per unit (0: as the file says, else millimetres); baseline: metres (0: as the file says).
+    world_frame: the frame of /tf that is the world; default: `map`, else `odom`, else the root of the tree.
+    pose: `fixed` for a static camera: every pose is the identity, and poses in the file are ignored.
+    imu: topic of the IMU (`sensor_msgs/Imu`), if there are several; `off` for none.
+    scale: metres per unit (0: the file's, else millimetres); baseline: metres (0: the file's).
     """
 
     depth: str = ""
@@ -73,26 +73,26 @@ class Options:
 
 
 class Bag(DepthSource):
-    """Depth images of one topic of a recorded file, with the poses that /tf or another topic tells.
+    """Depth images of one topic of a recorded file, with poses from /tf or another topic.
 
     Realsense-viewer writes `.db3` since librealsense 2.57 and `.bag` before; both are recognised by their topics and
-    tell camera, unit and baseline. In ordinary bags the depth topic has 16UC1 (millimetres), 32FC1 (metres) or
-    compressedDepth images, and `camera_info` next to it. Where there are several, `?depth=/topic` says which.
+    contain camera, unit and baseline. In ordinary bags the depth topic has 16UC1 (millimetres), 32FC1 (metres) or
+    compressedDepth images, and `camera_info` next to it. If there are several, `?depth=/topic` selects one.
 
-    The files are read message by message, not played back by pyrealsense2: that plays at its own pace, cannot go to
-    frame number i, and a damaged file may end it together with the program. Checked: `.db3` against files that
+    The files are read message by message, not played back by pyrealsense2, which plays at its own pace, cannot go to
+    frame number i, and may crash the program on a damaged file. Checked: `.db3` against files that
     pyrealsense2 2.59 recorded and against its own playback; RealSense `.bag` only against files made for the tests as
-    librealsense's `ros_writer.cpp` describes, which librealsense's own reader accepts; no bag of a real camera was at
-    hand.
+    librealsense's `ros_writer.cpp` describes, which librealsense's own reader accepts; no bag of a real camera was
+    available.
 
-    Pixels without value: 0 in 16UC1, and all are UNKNOWN, none clears; 32FC1 follows REP 117: -inf is TOO_NEAR, NaN
-    UNKNOWN, +inf what `depth.far` says.
+    Invalid pixels: 0 in 16UC1, which is UNKNOWN and clears nothing; 32FC1 follows REP 117: -inf is TOO_NEAR, NaN
+    UNKNOWN, +inf as set by `depth.far`.
     Pictures of a camera that has the depth images' frame, or is fixed to it by /tf, help tracking.
-    Time: the image's own; in RealSense files that of the frame in its own clock domain. Pose: interpolated at that
-    time; what /tf tells of the images' frame comes first, at its ends held for up to 0.1 s (`pose_off_ns`). It is the
-    pose of the depth camera's optical frame unless `axes` says otherwise; where the poses are those of another camera,
-    or in another file, a camera pair (`pair.toml`) puts them together.
-    Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file` with the depth image all the same.
+    Time: the image's own; in RealSense files the frame's own clock domain. Pose: interpolated at that
+    time; /tf for the images' frame takes precedence, and holds for up to 0.1 s at its ends (`pose_off_ns`). It is the
+    pose of the depth camera's optical frame unless `axes` differs; for poses of another camera,
+    or in another file, use a camera pair (`pair.toml`).
+    Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file`, which keep the depth image.
     Raises SourceError for files that are empty, damaged or without usable depth, and for bad options.
     """
 
@@ -120,7 +120,7 @@ class Bag(DepthSource):
 
     @classmethod
     def depth_only(cls, where: str) -> Bag:
-        """Return the depth images without looking for poses: every pose is the identity."""
+        """Return the depth images without searching for poses: every pose is the identity."""
         return cls(where, posed=False)
 
     def __len__(self) -> int:
@@ -128,7 +128,7 @@ class Bag(DepthSource):
 
     @cached_property
     def _photos(self) -> PhotoTopic | None:
-        """Pictures that were taken along with the depth images."""
+        """Pictures taken with the depth images."""
         return find_photos(self._file, self._depth, lambda: self._tf)
 
     @cached_property
@@ -137,7 +137,7 @@ class Bag(DepthSource):
         return self._poses.poses.tf if isinstance(self._poses, TurnedTf) else read_tf(self._file)
 
     def gravity(self) -> NDArray[np.float64] | None:
-        """Return the unit vector (3,) that points up in the world of the poses by an IMU; None if nothing tells."""
+        """Return the unit vector (3,) that points up in the world of the poses by an IMU; None if unknown."""
         found = self._poses
         if not isinstance(found, TurnedTf) or found.world != "file":
             return None
@@ -150,7 +150,7 @@ class Bag(DepthSource):
         return read_readings(self._file, self._tf, self._depth.frame_id, self._imu)
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN if there is none."""
+        """Return frame `i`; depth is (0, 0) if the image has a `fault`, the pose NaN if it is missing."""
         i = range(len(self))[i]
         frame = depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
         if self._photos is not None and frame.depth.size:
@@ -177,7 +177,7 @@ def depth_frame(
 ) -> Frame:
     """Return image `i` of a topic as a frame with the pose at its time, T_world_sensor; see `Bag.frame`.
 
-    name: for messages. scale: metres per unit, 0 for what the recording says. pose: may raise FrameRefused.
+    name: for messages. scale: metres per unit, 0 for the recording's own. pose: may raise FrameRefused.
     """
     blank = Frame(np.empty((0, 0), np.uint16), camera, np.full((4, 4), np.nan), images.stamp_ns(i), name=name)
     try:
@@ -192,7 +192,7 @@ def depth_frame(
 
 
 def file_part(where: str) -> str:
-    """Return `where` without options; an existing path with a `?` in its name comes first. Never raises."""
+    """Return `where` without options; an existing path with a `?` in its name takes precedence. Never raises."""
     try:
         whole = Path(where).exists()
     except (OSError, ValueError):
@@ -247,7 +247,7 @@ def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
     """Return the poses in a `.bag` or `.db3`, for a camera pair; `where` may name the topic: `t265.bag?poses=/topic`.
 
     `axes` and `world` as in `read_tracker`; T_world_body of a T265 has its confidence.
-    Raises SourceError if there is none.
+    Raises SourceError if it has no poses.
     """
     path, options = parse(str(where))
     options = replace(options, pose="", world_frame="", axes=axes or options.axes, world=world or options.world)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of ground robots and finished maps (OccupancyGrid, Octomap), parsed from their serialised bytes.
 
-ROS 1 and ROS 2 (CDR) alike, as in `messages`. All raise ValueError, one line, for bytes that are too few or values that
-are impossible; no allocation trusts a declared length.
+For both ROS 1 and ROS 2 (CDR), as in `messages`. All raise ValueError, one line, for too few bytes or impossible
+values; no allocation trusts a declared length.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NUMBERS = {5: "i4", 6: "u4", **FLOATS}
 POINT_TIMES = ("time", "t", "timestamp", "offset_time", "time_stamp")
 """Fields with the time of each point: Velodyne's, Ouster's, Hesai's, Livox's, and others'."""
 CLOCK_FROM, NANOSECONDS_FROM = 1e6, 1e15
-"""Numbers from which a time is one of a clock, in seconds and in nanoseconds."""
+"""Numbers above which a time is a clock's, in seconds and in nanoseconds."""
 MAX_FIELDS = 256
 MAX_BEAMS = 100_000
 LARGEST = 1e9
@@ -56,25 +56,25 @@ class LaserScan:
 def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
     """Return a `sensor_msgs/LaserScan`; `range_max`, if given, replaces the message's own, and all beyond it is far.
 
-    Ranges become (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for "no reading")
-    become -inf, which clears nothing; range_max itself and +inf become +inf, which clears up to range_max. Ranges
-    beyond the message's own range_max are discarded (NaN), as LaserScan.msg asks: some drivers write range_max + 1 for
-    "nothing there", others 65.533 m for "dazzled". Raises ValueError also for invalid angles and limits.
+    Ranges become (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (many drivers' "no reading") become -inf,
+    which clears nothing; range_max itself and +inf become +inf, which clears up to range_max. Ranges beyond the
+    message's own range_max are discarded (NaN), as LaserScan.msg asks: some drivers write range_max + 1 for "nothing
+    there", others 65.533 m for "dazzled". Raises ValueError also for invalid angles and limits.
     """
     stamp_ns, frame_id = wire.header()
     angle_min, _, angle_step, _, _, range_min, declared_max = wire.numbers("f", 7)
     given, range_max = range_max, range_max or declared_max
     count = wire.number()
     if count > MAX_BEAMS:
-        raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")
+        raise ValueError(f"a scan of {count} ranges; no lidar has that many beams")
     ranges = wire.array("f4", count).astype(np.float32, copy=False)
     if not len(ranges):
         raise ValueError("a scan with no ranges")
     if not (np.isfinite([angle_min, angle_step]).all() and 0 < abs(angle_step) <= 2 * np.pi):
-        raise ValueError(f"a scan that begins at angle {angle_min:g} with steps of {angle_step:g} is none")
+        raise ValueError(f"a scan that begins at angle {angle_min:g} with steps of {angle_step:g} is invalid")
     if not (np.isfinite([range_min, range_max]).all() and 0 <= range_min < range_max):
         raise ValueError(
-            f"a scan between range_min {range_min:g} and range_max {range_max:g} is none; give ?range_max="
+            f"a scan between range_min {range_min:g} and range_max {range_max:g} is invalid; give ?range_max="
         )
     with np.errstate(invalid="ignore"):
         near = (ranges < np.float32(range_min)) | (ranges <= 0)
@@ -86,9 +86,9 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point there.
+    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point.
 
-    times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None if the cloud does not say.
+    times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None if the cloud has no times.
     """
 
     stamp_ns: int
@@ -98,10 +98,10 @@ class PointCloud:
 
 
 def read_point_cloud(wire: Wire) -> PointCloud:
-    """Return a `sensor_msgs/PointCloud2`: its fields x, y and z, wherever they stand, as 4 or 8 byte floats.
+    """Return a `sensor_msgs/PointCloud2`: its fields x, y and z, at any offset, as 4 or 8 byte floats.
 
-    Times of points: the first field of `POINT_TIMES` there is.
-    Raises ValueError for a cloud without them, of a size that its data does not have, or of points that overlap.
+    Times of points: the first existing field of `POINT_TIMES`.
+    Raises ValueError for a cloud without them, with too little data, or with overlapping points.
     """
     stamp_ns, frame_id = wire.header()
     height, width = wire.numbers("I", 2)
@@ -114,7 +114,7 @@ def read_point_cloud(wire: Wire) -> PointCloud:
             raise ValueError(f"a cloud without {axis} (it has {', '.join(fields)[:80] or 'no fields'})")
         offset, kind = fields[axis]
         if kind not in FLOATS:
-            raise ValueError(f"{axis} is of type {kind}, no float; convert the cloud to FLOAT32")
+            raise ValueError(f"{axis} is of type {kind}, not a float; convert the cloud to FLOAT32")
         types.append(np.dtype(f"{order}{FLOATS[kind]}"))
         offsets.append(offset)
     end = max(offset + dtype.itemsize for offset, dtype in zip(offsets, types, strict=True))
@@ -143,8 +143,8 @@ def read_point_cloud(wire: Wire) -> PointCloud:
 
 
 def _seconds(given: NDArray[np.generic], stamp_ns: int) -> NDArray[np.float64]:
-    """Return times of points in seconds from their cloud's stamp: whole numbers are nanoseconds, others seconds; those
-    of a clock, not of the sweep, are so large that they say so themselves.
+    """Return times of points in seconds from their cloud's stamp: integers are nanoseconds, others seconds; large
+    numbers are clock times and not offsets within the sweep.
     """
     if given.dtype.kind in "iu":
         return 1e-9 * given.astype(np.float64)
@@ -169,19 +169,19 @@ class StampedTransform:
 
 
 def read_odometry(wire: Wire) -> StampedTransform:
-    """Return the pose in a `nav_msgs/Odometry`; covariance and speed are left."""
+    """Return the pose in a `nav_msgs/Odometry`, without covariance and speed."""
     return _transform(wire)
 
 
 def read_transforms(wire: Wire) -> list[StampedTransform]:
-    """Return the transforms in a `tf2_msgs/TFMessage`, or in a `tf/tfMessage`, which is written alike."""
+    """Return the transforms in a `tf2_msgs/TFMessage`, or in a `tf/tfMessage`, which has the same encoding."""
     return [_transform(wire) for _ in range(wire.number())]
 
 
 def read_path(wire: Wire, most: int | None = None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return times (N,) in nanoseconds and tx ty tz qx qy qz qw (N, 7) of the poses in a `nav_msgs/Path` that are some.
+    """Return times (N,) in nanoseconds and tx ty tz qx qy qz qw (N, 7) of the valid poses in a `nav_msgs/Path`.
 
-    The frames in the headers of the poses are left: they are those of the path. most: read so many at most.
+    The frames in the headers of the poses are ignored: they equal the path's. most: largest number to read.
     """
     wire.header()
     count = wire.number()
@@ -203,12 +203,12 @@ def frame_name(frame_id: str) -> str:
 
 
 def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
-    """Return a `nav_msgs/OccupancyGrid`; values outside 0 to 100 are unknown, as navigation programs treat them.
+    """Return a `nav_msgs/OccupancyGrid`; values outside 0 to 100 are unknown, as in navigation programs.
 
-    The message's resolution is a float32: the shortest number that rounds to it is used, 0.05 for 0.0500000007.
+    The message's resolution is a float32; the shortest number that rounds to it is used: 0.05 for 0.0500000007.
     """
     wire.header()
-    wire.numbers("I", 2)  # when the map was loaded
+    wire.numbers("I", 2)  # time at which the map was loaded
     resolution = float(str(np.float32(wire.number("f"))))
     width, height = wire.numbers("I", 2)
     x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)

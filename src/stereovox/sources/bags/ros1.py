@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 1 bags: rosbags reads the index; a bounded file and bounded decompression keep damage harmless."""
+"""ROS 1 bags: rosbags reads the index; bounded reads and bounded decompression make damage harmless."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CHUNKS = 4
 
 
 class Ros1File(BagFile):
-    """A ROS 1 bag of version 2.0, not packed or with bz2 or lz4; rosbags reads its index."""
+    """A ROS 1 bag of version 2.0, uncompressed or with bz2 or lz4; rosbags reads its index."""
 
     def __init__(self, path: Path):
         try:
@@ -34,7 +34,7 @@ class Ros1File(BagFile):
         self._reader = Reader(cast(Any, _Bounded(path)))
         try:
             self._reader.open()
-        except Exception as error:  # rosbags tells of damage by a dozen kinds of exceptions, assertions among them
+        except Exception as error:  # rosbags reports damage by a dozen kinds of exceptions, including assertions
             raise SourceError(
                 f"{path}: {one_line(error)}; repair it with 'rosbag reindex' or record it again"
             ) from None
@@ -61,7 +61,7 @@ class Ros1File(BagFile):
         try:
             with self._lock:
                 return Wire(self._message(entry), cdr=False)
-        except Exception as error:  # as above, and those of bz2 and lz4
+        except Exception as error:  # as above, and exceptions of bz2 and lz4
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
     def _message(self, entry: Any) -> bytes:
@@ -90,7 +90,7 @@ class Ros1File(BagFile):
 
 
 class _Bounded:
-    """A path whose file never gives out, and never makes room for, more bytes than it has left."""
+    """A path whose file never reads, or allocates memory for, more bytes than it has left."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -115,7 +115,7 @@ class _BoundedFile:
 
 
 def _unpacked(data: bytes, decompressor: Any) -> bytes:
-    """Return the contents of a chunk; raises ValueError for one that is damaged or swells beyond `MAX_BYTES`."""
+    """Return the contents of a chunk; raises ValueError if it is damaged or expands beyond `MAX_BYTES`."""
     from rosbags.rosbag1.reader import decompressors
 
     packing = next((name for name in ("bz2", "lz4") if decompressors[name] is decompressor), "")

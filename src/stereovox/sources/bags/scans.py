@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
+"""Topics of a ground robot in a recording: scans, or point clouds instead, and odometry."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ MAX_ATTEMPTS = 5
 
 
 class ScanTopic:
-    """Scans, or clouds, of one topic in the order in which they were recorded.
+    """Scans, or clouds, of one topic in order of recording.
 
-    frame_id: frame of the first that can be read, "" if none says.
+    frame_id: frame of the first readable one, "" if unnamed.
     """
 
     def __init__(self, file: BagFile, topic: str, range_max: float = 0.0):
@@ -60,7 +60,7 @@ class ScanTopic:
         return (f"{self.path}: {share} are beyond its range_max and are discarded; {cure}",)
 
     def name(self, i: int) -> str:
-        """Return what to call scan `i` in messages."""
+        """Return the name of scan `i` for messages."""
         return f"{self.path} {self.topic} message {i}"
 
     def recorded_ns(self, i: int) -> int:
@@ -82,7 +82,7 @@ def find_scans(
 ) -> tuple[ScanTopic | None, tuple[str, ...]]:
     """Return the scans of `topic`, else of the topic with most scans, else with most clouds, and notes.
 
-    depth_frame: frame of the depth images; clouds in it are made of them, and are left alone. None: no scans.
+    depth_frame: frame of the depth images; clouds in it are made from them and are ignored. None: no scans.
     Raises SourceError if the named topic does not exist or has no scans.
     """
     if topic:
@@ -98,13 +98,13 @@ def find_scans(
     best, note = busiest_topic(file, found), ()
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
-        note = (f"{file.path}: scans of {best}, which has most; there are {others} too: say ?scan=/topic for those",)
+        note = (f"{file.path}: scans of {best}, which has the most; there are {others} too: add ?scan=/topic for them",)
     scans = ScanTopic(file, best, range_max)
     return scans, (*note, *scans.notes)
 
 
 def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:
-    """Raise SourceError if there is no such topic, or it holds none of these kinds of messages."""
+    """Raise SourceError if there is no such topic, or its messages are of another kind."""
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in (kinds := tuple(kinds)):
@@ -112,12 +112,12 @@ def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) ->
 
 
 def busiest_topic(file: BagFile, topics: list[str]) -> str:
-    """Return the topic with most messages, the first of several."""
+    """Return the topic with the most messages, the first if several are equal."""
     return max(topics, key=lambda topic: len(file.stamps(topic)))
 
 
 def frame_id_of(file: BagFile, topic: str) -> str:
-    """Return the frame that the header of the first readable message of a topic names, "" if none does."""
+    """Return the frame in the header of the first readable message of a topic, "" if there is none."""
     for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return frame_name(file.read(topic, i).header()[1])
@@ -129,7 +129,7 @@ def frame_id_of(file: BagFile, topic: str) -> str:
 def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
     """Return the topic with the robot's odometry, "" if there is none, and notes.
 
-    given: preferred unless ""; other: a topic to ignore. Of several the one with most messages counts. Raises
+    given: preferred unless ""; other: a topic to ignore. Of several, the one with the most messages is used. Raises
     SourceError if the given one does not exist or is not odometry.
     """
     if given:
@@ -140,7 +140,7 @@ def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str
         return "", ()
     best = busiest_topic(file, found)
     others = ", ".join(topic for topic in found if topic != best)
-    note = f"odometry of {best}, which has most; there is {others} too: say ?odom=/topic or ?truth=/topic for it"
+    note = f"odometry of {best}, which has the most; there is {others} too: add ?odom=/topic or ?truth=/topic for it"
     return best, (f"{file.path}: {note}",) if others else ()
 
 
@@ -169,7 +169,7 @@ def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
         if is_motion(message.numbers):
             edge.add(message.stamp_ns or int(recorded[i]), message.numbers)
     if not edge.count:
-        raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?odom=/topic")
+        raise SourceError(f"{file.path}: {topic}: no pose can be read; name another with ?odom=/topic")
     return edge
 
 

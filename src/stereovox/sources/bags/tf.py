@@ -22,15 +22,15 @@ from stereovox.sources.poses.poses import seconds_from_ns
 
 STILL = 1e-9
 WORLDS = ("map", "odom")
-"""Frames used as the world, the first that exists: REP 105."""
+"""Frames used as the world; the first that exists (REP 105)."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far in time transforms may be from a query.
+    """Limits on the time between transforms and a query.
 
-    max_gap_s: longest time between two transforms that is bridged. extrapolate_s: how long the last transform holds
-    after its time, and the first before it; a robot of 1 m/s is 0.1 m off after 0.1 s.
+    max_gap_s: longest bridged time between two transforms. extrapolate_s: how long the last transform holds
+    after its time, and the first before it; a robot at 1 m/s is 0.1 m off after 0.1 s.
     """
 
     max_gap_s: float = 0.5
@@ -41,7 +41,7 @@ class Edge:
     """The pose of frame `child` in frame `parent`: at the times of its transforms and between them, or always (fixed).
 
     A frame that has the same transform in all messages, at least two, counts as a fixed one that is sent repeatedly:
-    any gap between them is bridged, and the ends hold for `max_gap_s`.
+    any gap is bridged, and the ends hold for `max_gap_s`.
     """
 
     def __init__(self, parent: str, child: str, name: str = ""):
@@ -63,13 +63,13 @@ class Edge:
 
     @property
     def moves(self) -> bool:
-        """Whether the child was seen to move in its parent."""
+        """Whether the child moved in its parent."""
         if not self.fixed:
             self._in_order()
         return not (self.fixed or self._still)
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
-        """Add tx ty tz qx qy qz qw at a time; of several with one time the first counts."""
+        """Add tx ty tz qx qy qz qw at a time; of several at one time, the first counts."""
         self._stamps.append(stamp_ns)
         self._rows.extend(numbers)
         self._sorted = None
@@ -81,7 +81,7 @@ class Edge:
     def at(self, stamp_ns: int, limits: Limits, where: str) -> Transform:
         """Return T_parent_child at a time: straight line in position, constant turn rate in rotation.
 
-        Raises FrameRefused `no_pose`, which names the edge and the gap, where the limits do not allow it.
+        Raises FrameRefused `no_pose`, with the edge and the gap, if the limits do not allow it.
         """
         if self._fixed is not None:
             return self._fixed
@@ -101,7 +101,7 @@ class Edge:
         return interpolate(_motion(rows[after - 1]), _motion(rows[after]), (stamp_ns - start) / (end - start))
 
     def off_ns(self, stamp_ns: int) -> int:
-        """Return how far a time lies before the first transform or after the last; 0 where the frame is fixed."""
+        """Return the distance of a time from the range of the transforms; 0 if the frame is fixed."""
         if self._fixed is not None:
             return 0
         stamps, _ = self._in_order()
@@ -138,8 +138,8 @@ class Tf:
     where: their origin, for messages. limits: how far apart transforms may be, and how long the last one holds.
     unreadable: number of unreadable messages of transforms.
 
-    Where a frame has several parents, one with a fixed transform counts, else the most frequent, else the first;
-    `notes` say so. Invalid transforms (see `is_motion`), and those of a frame to itself, are skipped, as in tf2.
+    If a frame has several parents, one with a fixed transform counts, else the most frequent, else the first;
+    `notes` report it. Invalid transforms (see `is_motion`), and transforms to the same frame, are skipped, as in tf2.
     """
 
     def __init__(self, where: str = "tf", limits: Limits | None = None):
@@ -151,7 +151,7 @@ class Tf:
     def add(self, parent: str, child: str, stamp_ns: int, numbers: Iterable[float], fixed: bool = False) -> None:
         """Add the pose of `child` in `parent` at a time, or at all times: tx ty tz in metres, quaternion qx qy qz qw.
 
-        In any order. Of several with one time the first counts, of several fixed ones the last.
+        In any order. Of several at one time, the first counts; of several fixed ones, the last.
         """
         row, parent, child = tuple(map(float, numbers)), frame_name(parent), frame_name(child)
         if not (parent and child and parent != child and is_motion(row)):
@@ -172,15 +172,15 @@ class Tf:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What had to be decided or skipped, one line each."""
+        """Choices made and messages skipped, one line each."""
         torn = {child: self._up(child) for child, edges in sorted(self._parents.items()) if len(edges) > 1}
         notes = [
-            f"{self.where}: {child} has several parents ({', '.join(self._parents[child])}); {edge.parent} counts"
+            f"{self.where}: {child} has several parents ({', '.join(self._parents[child])}); {edge.parent} is used"
             for child, edge in torn.items()
             if edge
         ]
         if self._skipped:
-            notes.append(f"{self.where}: {self._skipped} transforms are none and were left out")
+            notes.append(f"{self.where}: {self._skipped} transforms are invalid and were left out")
         if self.unreadable:
             notes.append(f"{self.where}: {self.unreadable} messages cannot be read and were left out")
         return tuple(notes)
@@ -195,7 +195,7 @@ class Tf:
         return inverse(self._along(up, stamp_ns)) @ self._along(down, stamp_ns)
 
     def off_ns(self, target: str, source: str, stamp_ns: int) -> int:
-        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that are not connected."""
+        """Return how far `lookup` extrapolates; raises FrameRefused as it does for unconnected frames."""
         up, down = self._path(frame_name(target), frame_name(source))
         return max((edge.off_ns(int(stamp_ns)) for edge in (*up, *down)), default=0)
 
@@ -208,11 +208,11 @@ class Tf:
         return True
 
     def moving(self, target: str, source: str) -> bool:
-        """Return whether one frame was seen to move in the other; raises FrameRefused if they are not connected."""
+        """Return whether one frame moved in the other; raises FrameRefused if they are not connected."""
         return any(edge.moves for part in self._path(frame_name(target), frame_name(source)) for edge in part)
 
     def root(self, frame: str) -> str:
-        """Return the frame that has no parent, above `frame`; raises FrameRefused for an unknown frame and a loop."""
+        """Return the root of the tree above `frame`; raises FrameRefused for an unknown frame and a loop."""
         chain = self._chain(frame_name(frame))
         return chain[-1].parent if chain else frame_name(frame)
 
@@ -246,7 +246,7 @@ class Tf:
             chain.append(edge)
             if edge.parent in seen:
                 loop = " -> ".join([*seen[seen.index(edge.parent) :], edge.parent])
-                raise FrameRefused("no_pose", f"{self.where}: frames go round in a loop: {loop}; correct their parents")
+                raise FrameRefused("no_pose", f"{self.where}: frames form a loop: {loop}; correct their parents")
             seen.append(edge.parent)
         return tuple(chain)
 
@@ -259,7 +259,9 @@ class Tf:
                 parts = " and ".join(
                     f"{frame} (root {root})" for frame, root in zip((target, source), roots, strict=True)
                 )
-                raise FrameRefused("no_pose", f"{self.where}: nothing connects {parts}; record what joins them")
+                raise FrameRefused(
+                    "no_pose", f"{self.where}: nothing connects {parts}; record the transforms between them"
+                )
             while up and down and up[-1] is down[-1]:
                 up, down = up[:-1], down[:-1]
             self._paths[target, source] = found = up, down
@@ -278,15 +280,15 @@ EdgePath = tuple[tuple[Edge, ...], tuple[Edge, ...]]
 
 
 def tf_topics(file: BagFile) -> list[str]:
-    """Return `/tf` and `/tf_static`, or where there is neither those of a namespace (`/robot/tf`)."""
+    """Return `/tf` and `/tf_static`, or without these the topics of a namespace (`/robot/tf`)."""
     found = sorted(topic for topic, kind in file.types.items() if kind in TF_TYPES)
     return [topic for topic in found if topic in ("/tf", "/tf_static")] or found
 
 
 def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
-    """Return the transforms of a recording, None if it has no topic of them.
+    """Return the transforms of a recording, None if it has no such topic.
 
-    Those of a topic named `tf_static` are valid at all times. Unreadable messages are skipped and leave gaps.
+    Transforms of a topic named `tf_static` are valid at all times. Unreadable messages are skipped and leave gaps.
     """
     topics = tf_topics(file)
     if not topics:
@@ -315,7 +317,7 @@ class TfPoses:
 
     @property
     def where(self) -> str:
-        """What the poses came from, for messages."""
+        """Origin of the poses, for messages."""
         return f"{self.tf.where} ({self.world} -> {self.body})"
 
     def at(self, stamp_ns: int) -> Transform:
@@ -330,7 +332,7 @@ class TfPoses:
 def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
     """Return the poses of frame `body` in `world`, or the reason, in one line, why there are none.
 
-    world: "" for `map`, else `odom`, where it is connected with `body`, else the root of its tree if it moved there.
+    world: "" for `map`, else `odom`, if it is connected with `body`, else the root of its tree if it moved there.
     Raises SourceError if a given `world` is not connected with `body`.
     """
     body, world = frame_name(body), frame_name(world)
@@ -343,7 +345,7 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
         if world:
             raise SourceError(f"{refused}; correct ?world_frame={world}") from None
         return str(refused)
-    return f"{tf.where}: reports how {body} is mounted on {name}, not where that was"
+    return f"{tf.where}: has the mount of {body} on {name}, but not where that was"
 
 
 def _motion(numbers: NDArray[np.float64]) -> Transform:

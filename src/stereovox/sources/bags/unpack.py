@@ -10,7 +10,7 @@ from stereovox.errors import MissingExtra
 
 STEP = 4 * 1024 * 1024
 MAX_RATIO = 1000
-"""Largest ratio of decompressed to compressed bytes: recordings of real scenes do not compress as well."""
+"""Largest ratio of decompressed to compressed bytes: recordings of real scenes never reach it."""
 ALWAYS_ALLOWED = 32 * 1024 * 1024
 """Decompressed bytes that are always accepted: an empty image compresses to almost nothing."""
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -18,25 +18,25 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def max_unpacked(packed: int) -> int:
-    """Return the largest decompressed size accepted for so many compressed bytes; more is treated as an attack."""
+    """Return the largest decompressed size accepted for this many compressed bytes; more counts as an attack."""
     return max(ALWAYS_ALLOWED, MAX_RATIO * packed)
 
 
 def decompress(data: bytes | memoryview, compression: str, limit: int) -> bytes:
     """Return decompressed bytes; compression: `bz2`, `lz4`, `zstd`, or "" and `none` for none.
 
-    Raises ValueError for data that is damaged, truncated, compressed otherwise, or exceeds `limit` or `max_unpacked`,
-    and MissingExtra if the library for it is not installed.
+    Raises ValueError for data that is damaged, truncated, in another format, or exceeds `limit` or `max_unpacked`,
+    and MissingExtra if its library is not installed.
     """
     if compression in ("", "none"):
         return bytes(data)
     limit = min(limit, max_unpacked(len(data)))
     if compression == "zstd" and _declared_size(data) > limit:
-        raise ValueError("tells of an absurd size")
+        raise ValueError("declares an absurd size")
     parts, size, rest = [], 0, bytes(data)
-    while rest and size <= limit:  # several packed pieces may follow each other
+    while rest and size <= limit:  # there may be several packed pieces
         unpacking = _decompressor(compression)
-        while not unpacking.eof and size <= limit:  # in steps: lz4 makes room for all of `max_length` at once
+        while not unpacking.eof and size <= limit:  # in steps: lz4 allocates all of `max_length` at once
             parts.append(_step(unpacking, rest))
             rest = b""
             size += len(parts[-1])
@@ -59,7 +59,7 @@ def decompress_message(data: bytes, limit: int) -> bytes:
 def _declared_size(data: bytes | memoryview) -> int:
     zstd = _zstd()
     try:
-        return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it need not be reported
+        return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it may be missing
     except zstd.ZstdError as error:
         raise ValueError(f"cannot be unpacked: {error}") from None
 
@@ -80,7 +80,7 @@ def _decompressor(compression: str) -> Any:
         return _lz4().LZ4FrameDecompressor()
     if compression == "zstd":
         return _zstd().ZstdDecompressor()
-    raise ValueError(f"packed with '{compression[:20]}', which is not known")
+    raise ValueError(f"packed with '{compression[:20]}', which is unknown")
 
 
 def _lz4() -> Any:

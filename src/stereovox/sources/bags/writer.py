@@ -27,30 +27,30 @@ from stereovox.sources.bags.files import UNFINISHED, one_line
 from stereovox.sources.bags.writer_messages import Messages, metres, millimetres, packed_png
 
 SECONDS = {1: 2**32, 2: 2**31}
-"""Seconds that a time of ROS 1 (uint32) and of ROS 2 (int32) can count."""
+"""Largest seconds in a time of ROS 1 (uint32) and of ROS 2 (int32)."""
 TF_MESSAGE, OCTOMAP = "tf2_msgs/msg/TFMessage", "octomap_msgs/msg/Octomap"
 NOT_IN_ROSBAGS = {
     TF_MESSAGE: "geometry_msgs/TransformStamped[] transforms\n",
     OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
 }
-"""Definitions of messages that rosbags' types of a ROS may lack."""
+"""Definitions of messages that rosbags' types may lack."""
 VERSION = 8
-"""Of rosbag2's metadata: the newest that every distribution since Humble reads."""
+"""Version of rosbag2's metadata: the newest that every distribution since Humble reads."""
 IMAGE, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 RIGID = 1e-6
 
 
 class BagWriter:
-    """Writes a recording, all or nothing: it stands at `path` when the `with` block ends well, else nothing does.
+    """Writes a recording, all or nothing: it is at `path` when the `with` block ends without error, else nothing is.
 
     path: ends in `.bag` for ROS 1, in `.db3` or `.mcap` for one file of ROS 2; any other name is a rosbag2 folder,
-        with an `.mcap` in it. An older file is replaced, and stays whole if writing fails; a folder must be new or
+        with an `.mcap` in it. An older file is replaced, and stays intact if writing fails; a folder must be new or
         empty.
-    packed: chunks of a `.bag` are packed with lz4, those of `.mcap` with zstd; `.db3` is never packed.
+    packed: chunks of a `.bag` are packed with lz4, chunks of an `.mcap` with zstd; `.db3` is never packed.
 
-    Times are int64 nanoseconds since whatever the clock counts from, not negative; each message is recorded at its own
-    time. Messages may come in any order, but readers are quickest where they come in order of time.
-    Raises MissingExtra without rosbags; SourceError for what cannot be written.
+    Times are int64 nanoseconds since the clock's own epoch, not negative; each message is recorded at its own
+    time. Messages may be in any order, but readers are fastest if they are in order of time.
+    Raises MissingExtra without rosbags; SourceError if the recording cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, packed: bool = True):
@@ -78,16 +78,17 @@ class BagWriter:
             raise
 
     def complete(self) -> None:
-        """Complete the recording and put it at `path`; if that fails, it is for `leave` to say what there is."""
+        """Complete the recording and move it to `path`; if that fails, `leave` reports what is left."""
         self._flush_fixed()
         self._file.finish()
 
     def sync(self) -> None:
-        """Flush what was written to the disk, so that no loss of power takes it; all but the last megabyte."""
+        """Flush written messages to the disk, all but the last megabyte, so that a loss of power does not destroy
+        them."""
         self._file.sync()
 
     def leave(self) -> str:
-        """End a recording that cannot be completed; return which file has what was written, nothing if none has."""
+        """End a recording that cannot be completed; return the file with the messages so far, "" if there is none."""
         return self._file.leave()
 
     def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
@@ -107,8 +108,8 @@ class BagWriter:
         """Write a depth image and, on `camera_info` next to it, its camera; the pose is not written.
 
         uint16 depth becomes 16UC1 millimetres, float depth 32FC1 metres (REP 118). compressed: whole millimetres as PNG
-        on `<topic>/compressedDepth`. What a `sensor_msgs/CameraInfo` does not hold is lost: the baseline, a correction,
-        and the reasons why pixels have no value.
+        on `<topic>/compressedDepth`. Fields that `sensor_msgs/CameraInfo` lacks are lost: the baseline, a correction,
+        and the reasons of invalid pixels.
         """
         camera = frame.camera
         if not isinstance(camera, PinholeCamera) or frame.depth.shape != (camera.height, camera.width):
@@ -130,9 +131,9 @@ class BagWriter:
         topic: str = "/camera/color/image_raw",
         frame_id: str = "camera_color_optical_frame",
     ) -> None:
-        """Write the picture that was taken with a depth image, and its camera on `camera_info` next to it.
+        """Write the picture taken with a depth image, and its camera on `camera_info` next to it.
 
-        Where it is next to the depth camera is for `fixed` to write; the same `frame_id`: depth is registered to it.
+        Write its mount on the depth camera with `fixed`. The same `frame_id` means that depth is registered to it.
         """
         if frame.photo is None:
             raise SourceError(f"{self.path}: {frame.name or topic} has no picture; leave it out")
@@ -172,15 +173,16 @@ class BagWriter:
         self.transform(stamp_ns, odom_frame, base_frame, lifted(pose))
 
     def transform(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Write where a frame stands in its parent at one moment, (4, 4), on `/tf`."""
+        """Write the pose of a frame in its parent at one moment, (4, 4), on `/tf`."""
         edge = parent, child, self._rigid(T_parent_child, parent, child)
         self._write("/tf", TF_MESSAGE, stamp_ns, self._messages.transforms(stamp_ns, [edge]))
 
     def fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Write the constant pose of a frame in its parent, (4, 4), on `/tf_static`.
 
-        All poses given so far go into one message before the next of another kind, since only the last message of this
-        topic is kept for late subscribers.
+        All poses given so far go into one message before the next message of another kind, since only the last message
+        of
+        this topic is kept for late subscribers.
         """
         self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
         self._due = True
@@ -243,12 +245,14 @@ class BagWriter:
     def _planar(self, pose: ArrayLike) -> NDArray[np.float64]:
         numbers = np.asarray(pose, float)
         if numbers.shape != (3,) or not np.isfinite(numbers).all():
-            raise SourceError(f"{self.path}: {pose} is no pose; give x, y and yaw, all finite")
+            raise SourceError(f"{self.path}: {pose} is not a pose; give x, y and yaw, all finite")
         return numbers
 
     def _rigid(self, T: Transform, parent: str, child: str) -> Transform:
         if rigidity_error(T) > RIGID:
-            raise SourceError(f"{self.path}: {parent} -> {child} is no rigid motion; give a (4, 4) rotation and shift")
+            raise SourceError(
+                f"{self.path}: {parent} -> {child} is not a rigid motion; give a (4, 4) rotation and translation"
+            )
         return np.asarray(T, float)
 
 
@@ -256,7 +260,7 @@ class BagFileWriter:
     """Serialises messages and writes them next to `path`; `finish` moves the whole recording there.
 
     ros: 1 for a path that ends in `.bag`, else 2. store: rosbags' types of that ROS. packed: chunks of a `.bag` are
-    packed with lz4, those of an `.mcap` and of a folder with zstd; `.db3` has no such thing.
+    packed with lz4, chunks of an `.mcap` and of a folder with zstd; `.db3` cannot be packed.
     Raises MissingExtra without rosbags, SourceError if the recording cannot be written.
     """
 
@@ -269,7 +273,7 @@ class BagFileWriter:
         self.store = typestore(self.ros)
         self._connections: dict[str, Any] = {}
         self._writer: Any = None
-        self._target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
+        self._target = Path(os.path.realpath(path))  # write through a link
         self._folder = self._target.with_name(f"{short_name(self._target)}.{uuid.uuid4().hex[:6]}{UNFINISHED}")
         self._check()
 
@@ -296,7 +300,7 @@ class BagFileWriter:
             if topic not in self._connections:
                 self._connections[topic] = self._connect(topic, kind, latched)
             if (held := self._connections[topic].msgtype) != kind:
-                raise SourceError(f"{self.path}: {topic} holds {held}, no {kind}; give each its own topic")
+                raise SourceError(f"{self.path}: {topic} holds {held}, not {kind}; give each its own topic")
             pack = self.store.serialize_ros1 if self.ros == 1 else self.store.serialize_cdr
             self._writer.write(self._connections[topic], int(stamp_ns), pack(message, kind))
 
@@ -304,12 +308,12 @@ class BagFileWriter:
         """Raise SourceError for a time that ROS cannot represent."""
         if not 0 <= stamp_ns < SECONDS[self.ros] * 1_000_000_000:
             limit = f"0 and {SECONDS[self.ros]} seconds"
-            raise SourceError(f"{self.path}: the time {stamp_ns} ns must lie between {limit}; shift the clock")
+            raise SourceError(f"{self.path}: the time {stamp_ns} ns must be between {limit}; shift the clock")
 
     def finish(self) -> None:
         """Complete the recording and move it into place; an older file of that name is replaced.
 
-        Where that fails, what was written is still next to `path`, until `abort`.
+        If that fails, the written data stays next to `path` until `abort`.
         """
         with self._one_line_errors():
             self._writer.close()
@@ -317,13 +321,13 @@ class BagFileWriter:
         self.abort()
 
     def sync(self) -> None:
-        """Flush what was written to the disk."""
+        """Flush written data to the disk."""
         for file in self._folder.rglob("*.*"):
             with suppress(OSError):  # SQLite's journal may be gone by now; a broken disk fails at the next message
                 sync_file(file)
 
     def leave(self) -> str:
-        """End the recording where it is, and return the file that can be read; without one, as `abort`."""
+        """End the recording in place, and return the readable file; without one, as `abort`."""
         grown = self._folder / self._target.stem / self._target.name
         if self._ending != ".mcap" or not grown.is_file():
             self.abort()
@@ -342,16 +346,16 @@ class BagFileWriter:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _check(self) -> None:
-        """Refuse a place that cannot hold the recording, before anything is written."""
+        """Refuse a path that cannot hold the recording, before anything is written."""
         file = self._ending in (".bag", ".db3", ".mcap")
         if file and self._target.is_dir():
             raise SourceError(f"{self.path}: is a folder; name a file")
         if not file and self._target.exists() and (not self._target.is_dir() or any(self._target.iterdir())):
             raise SourceError(
-                f"{self.path}: is there and not empty; give a new folder, or a name ending in .bag or .mcap"
+                f"{self.path}: exists and is not empty; give a new folder, or a name ending in .bag or .mcap"
             )
         if self._ending == ".db3" and set(str(self._target)) & set("?#%"):
-            raise SourceError(f"{self.path}: SQLite's library takes ?, # and % in a name amiss; choose another name")
+            raise SourceError(f"{self.path}: SQLite's library misreads ?, # and % in a name; choose another name")
 
     def _ros1(self) -> Any:
         from rosbags.rosbag1 import Writer
@@ -365,7 +369,7 @@ class BagFileWriter:
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
         sqlite = self._ending == ".db3"
-        # rosbags calls the file inside like its folder, and says so in the metadata
+        # rosbags gives the file inside the name of its folder, and records it in the metadata
         name = self._target.stem if self._ending in (".db3", ".mcap") else self._target.name
         plugin = StoragePlugin.SQLITE3 if sqlite else StoragePlugin.MCAP
         writer = Writer(self._folder / name, version=VERSION, storage_plugin=plugin)
@@ -398,7 +402,7 @@ class BagFileWriter:
             yield
         except OSError as error:
             reason = one_line(error.strerror or error)
-            cure = "choose a folder that exists, has room and can be written"
+            cure = "choose an existing folder with free space and write permission"
             raise SourceError(f"{self.path}: cannot be written ({reason}); {cure}") from None
         except SourceError:
             raise

@@ -19,19 +19,19 @@ PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""
 
 ENCODINGS = {"u2": "16UC1", "f4": "32FC1", "u1": "mono8"}
-"""What `sensor_msgs/Image` calls arrays (REP 118), by their types."""
+"""Encodings of `sensor_msgs/Image` (REP 118) by array type."""
 FLOAT32 = 7
-"""What `sensor_msgs/PointField` calls such numbers."""
+"""Type of float32 in `sensor_msgs/PointField`."""
 
 
 class Messages:
-    """Makes messages of one ROS: `store` has rosbags' types of it, `ros` is 1 or 2."""
+    """Makes messages of one ROS: `store` has rosbags' types, `ros` is 1 or 2."""
 
     def __init__(self, store: Any, ros: int):
         self._types, self._ros = store.types, ros
 
     def scan(self, scan: Scan, frame_id: str) -> Any:
-        """Return a `sensor_msgs/LaserScan` with the scan's ranges as they are (REP 117)."""
+        """Return a `sensor_msgs/LaserScan` with unchanged ranges (REP 117)."""
         step = scan.angle_step
         return self._make(
             "sensor_msgs/msg/LaserScan",
@@ -90,7 +90,7 @@ class Messages:
         )
 
     def odometry(self, pose: NDArray[np.float64], stamp_ns: int, parent: str, child: str) -> Any:
-        """Return a `nav_msgs/Odometry` of a (3,) pose x, y, yaw; speeds and covariances are zero: not known."""
+        """Return a `nav_msgs/Odometry` of a (3,) pose x, y, yaw; speeds and covariances are zero: unknown."""
         vector = self._make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         twist = self._make("geometry_msgs/msg/Twist", linear=vector, angular=vector)
         return self._make(
@@ -102,7 +102,7 @@ class Messages:
         )
 
     def imu(self, rate: ArrayLike | None, force: ArrayLike | None, stamp_ns: int, frame_id: str) -> Any:
-        """Return a `sensor_msgs/Imu` of (3,) rad/s and (3,) m/s^2; the first covariance of what is not measured is
+        """Return a `sensor_msgs/Imu` of (3,) rad/s and (3,) m/s^2; the first covariance of a missing measurement is
         -1.
         """
         return self._make(
@@ -124,7 +124,7 @@ class Messages:
         )
 
     def transforms(self, stamp_ns: int, edges: Sequence[tuple[str, str, Transform]]) -> Any:
-        """Return a `tf2_msgs/TFMessage` of T_parent_child, each (4, 4), with the names parent and child before it."""
+        """Return a `tf2_msgs/TFMessage` of edges: the names of parent and child, and T_parent_child (4, 4)."""
         stamped = [
             self._make(
                 "geometry_msgs/msg/TransformStamped",
@@ -220,7 +220,7 @@ class Messages:
 
 
 def _not_measured(numbers: ArrayLike | None) -> NDArray[np.float64]:
-    """Return a covariance (9,): unknown, or the word that nothing was measured (`sensor_msgs/Imu`)."""
+    """Return a covariance (9,): unknown, or marked as not measured (`sensor_msgs/Imu`)."""
     covariance = np.zeros(9)
     covariance[0] = -1.0 if numbers is None else 0.0
     return covariance
@@ -242,15 +242,15 @@ def millimetres(frame: Frame) -> NDArray[np.uint16]:
 
 
 def metres(frame: Frame) -> NDArray[np.float32]:
-    """Return a depth image in metres, (height, width) float32; what has no value stays as it is, NaN or zero."""
+    """Return a depth image in metres, (height, width) float32; invalid pixels stay NaN or zero."""
     return (np.asarray(frame.depth, float) * frame.depth_scale).astype(np.float32)
 
 
 def packed_png(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return what compressed_depth_image_transport sends for (height, width) uint16: 12 bytes, then a PNG."""
+    """Return the format of compressed_depth_image_transport for (height, width) uint16: 12 bytes, then a PNG."""
     import cv2
 
     whole, png = cv2.imencode(".png", depth, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not whole:
         raise ValueError("the image cannot be packed as PNG")
-    return np.concatenate([np.zeros(12, np.uint8), png.ravel()])  # zeros: parameters for packed floats, none here
+    return np.concatenate([np.zeros(12, np.uint8), png.ravel()])  # zeros: parameters for packed floats, unused here

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo calibrations as visual-inertial odometry keeps them: each camera next to its place on a body.
+"""Stereo calibrations in the formats of visual-inertial odometry: each camera with its pose on a body.
 
 Kalibr (also as OpenVINS writes it), sensor.yaml of EuRoC (also Kimera's), OKVIS, VINS-Fusion, ORB-SLAM3 and Basalt.
 In all of them `T_a_b` maps b into a, though names differ: Kalibr's T_cam_imu maps the body into the camera; T_imu_cam
@@ -68,7 +68,7 @@ def _kalibr(tables: Sequence[Table], folder: Path) -> StereoCalibration:
 
 
 def _kalibr_place(table: Table, name: str) -> Transform | None:
-    """Return T_body_cam (4, 4), None if the file has none; raises SourceError if both ways contradict."""
+    """Return T_body_cam (4, 4), None if the file has none; raises SourceError if both transforms contradict."""
     camera = table[name]
     T_cam_imu, T_imu_cam = (rigid(camera[key], f"{name}.{key}") if key in camera else None for key in PLACES)
     if T_cam_imu is None:
@@ -81,7 +81,7 @@ def _kalibr_place(table: Table, name: str) -> Transform | None:
 def _kalibr_lens(table: Table, name: str) -> Lens:
     camera = table[name]
     if not isinstance(camera, dict):
-        raise SourceError(f"{name} is no table; give the camchain as Kalibr wrote it")
+        raise SourceError(f"{name} is not a table; give the camchain as Kalibr wrote it")
     model, distortion = camera.get("camera_model"), camera.get("distortion_model", "none")
     try:
         ours = lens_model(distortion, name)
@@ -89,7 +89,7 @@ def _kalibr_lens(table: Table, name: str) -> Lens:
         ours = None
     if model != "pinhole" or ours is None:
         known = ", ".join(KALIBR)
-        raise SourceError(f"{name}: {model}-{distortion} is no lens we have ({known}); calibrate with one of them")
+        raise SourceError(f"{name}: {model}-{distortion} is not supported ({known}); calibrate with one of them")
     return _listed_lens(camera, name, ours, "distortion_coeffs")
 
 
@@ -101,14 +101,14 @@ def _listed_lens(camera: Table, name: str, model: str, distortion: str) -> Lens:
 
 
 def _asl(tables: Sequence[Table], folder: Path) -> StereoCalibration:
-    """Return the pair of two `sensor.yaml`, the body being that of T_BS."""
+    """Return the pair of two `sensor.yaml`; the body is that of T_BS."""
     if len(tables) != 2:
         raise SourceError("is the sensor.yaml of one camera; give both files: cam0/sensor.yaml cam1/sensor.yaml")
     lenses, bodies = [], []
     for table, eye in zip(tables, ("first", "second"), strict=True):
         model = table.get("camera_model")
         if model != "pinhole":
-            raise SourceError(f"the {eye} camera_model {shown(model)} is no lens we have; calibrate a pinhole")
+            raise SourceError(f"the {eye} camera_model {shown(model)} is not supported; calibrate a pinhole")
         ours = lens_model(table.get("distortion_model"), f"the {eye} distortion_model")
         lenses.append(_listed_lens(table, eye, ours, "distortion_coefficients"))
         bodies.append(rigid(_needed(table, eye, "T_BS"), f"{eye} T_BS"))
@@ -146,9 +146,7 @@ def _vins(tables: Sequence[Table], folder: Path) -> StereoCalibration:
 def _vins_lens(table: Table, name: str) -> Lens:
     kind = table.get("model_type")
     if kind not in VINS:
-        raise SourceError(
-            f"{name}: model_type {shown(kind)} is no lens we have ({', '.join(VINS)}); calibrate with one"
-        )
+        raise SourceError(f"{name}: model_type {shown(kind)} is not supported ({', '.join(VINS)}); calibrate with one")
     model, focal, coefficients = VINS[kind]
     values = table.get("projection_parameters", {})
     bent = table.get("distortion_parameters", values) if model == "pinhole" else values
@@ -158,16 +156,16 @@ def _vins_lens(table: Table, name: str) -> Lens:
 
 
 def _vins_alone(tables: Sequence[Table], folder: Path) -> StereoCalibration:
-    raise SourceError("is the lens of one camera of VINS-Fusion; give the settings that name it as cam0_calib")
+    raise SourceError("is one lens of VINS-Fusion; give the settings that name it as cam0_calib")
 
 
 def _orb(tables: Sequence[Table], folder: Path) -> StereoCalibration:
-    """Return the pair of ORB-SLAM3's settings: two lenses, images rectified already, or the older LEFT and RIGHT."""
+    """Return the pair of ORB-SLAM3's settings: two lenses, already rectified images, or the older LEFT and RIGHT."""
     table = tables[0]
     if "LEFT.K" in table:
         return _orb_rectification(table)
     if any(key.endswith("DepthMapFactor") for key in table):
-        raise SourceError("is of a depth camera, which has one lens; give the settings of a stereo camera")
+        raise SourceError("is for a depth camera, which has one lens; give the settings of a stereo camera")
     kind = str(table.get("Camera.type", "PinHole"))
     first = "Camera1" if "Camera1.fx" in table else "Camera"
     rectified = kind == "Rectified" or ("Camera.bf" in table and kind == "PinHole" and not _bent(table, first))
@@ -238,9 +236,7 @@ def _basalt(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         name = f"value0.intrinsics[{number}]"
         kind = _needed(cameras[number], name, "camera_type")
         if kind not in BASALT:
-            raise SourceError(
-                f"{name}: camera_type {shown(kind)} is no lens we have (pinhole, kb4); calibrate with one"
-            )
+            raise SourceError(f"{name}: camera_type {shown(kind)} is not supported (pinhole, kb4); calibrate with one")
         model, coefficients = BASALT[kind]
         values = _needed(cameras[number], name, "intrinsics")
         k = [_number(values, name, key) for key in coefficients]
@@ -275,4 +271,4 @@ CHAINS: tuple[tuple[Callable[[Table], bool], Callable[[Sequence[Table], Path], S
     (lambda table: any(key in table for key in ("Camera.type", "Camera1.fx", "Camera.fx", "LEFT.K")), _orb),
     (lambda table: isinstance(table.get("value0"), dict), _basalt),
 )
-"""For each kind how to recognise its (first) table, and its reader, which is given all tables and their folder."""
+"""For each kind, a test of its (first) table, and its reader, which receives all tables and their folder."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Import stereo calibrations of other tools as rigs; the kind of a file is recognised by what it holds."""
+"""Import stereo calibrations of other tools as rigs; the kind of a file is recognised by its contents."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ Size = tuple[int, int]
 def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
     """Return the rig in calibration files of a kind recognised by content; see `KINDS`.
 
-    size: width and height of the images where the files lack them. lens: `fisheye` where an OpenCV file has fisheye
+    size: width and height of the images if the files lack them. lens: `fisheye` if an OpenCV file has fisheye
     lenses; the other kinds declare it. name: of the pair; KITTI's are `grey` and `colour`. Raises SourceError for files
-    of another kind, and for what cannot be expressed as a rig.
+    of another kind, and for calibrations that a rig cannot express.
     """
     if not 1 <= len(files) <= 2:
         raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
@@ -86,12 +86,12 @@ def _calibration(tables: Sequence[Table], size: Size | None, lens: str, folder: 
             return read(tables, folder)
     if any(key in first for key in INFO["P"]) and first_present(first, INFO["K"]) is not None:
         if len(tables) != 2:
-            raise SourceError("is the camera_info of one eye; give both files, first the left")
+            raise SourceError("is the camera_info of one eye; give both files, the left one first")
         return camera_info(tables[0], tables[1])
     merged: Table = {key: value for table in reversed(tables) for key, value in table.items()}
     if first_present(merged, OPENCV["K1"]) is not None:
         return _opencv(merged, size, lens)
-    raise SourceError(f"is no stereo calibration of a known kind: {KINDS}")
+    raise SourceError(f"is not a stereo calibration of a known kind: {KINDS}")
 
 
 def camera_info(left: Table, right: Table) -> StereoCalibration:
@@ -135,7 +135,7 @@ def _opencv_size(table: Table) -> tuple[int, int]:
         if key in table:
             width, height = numbers(data_of(table[key]), key, 2)
             return int(width), int(height)
-    raise SourceError("does not tell the size of the images; give it with --size WIDTHxHEIGHT")
+    raise SourceError("does not contain the size of the images; give it with --size WIDTHxHEIGHT")
 
 
 def _is_kitti(path: Path) -> bool:
@@ -147,7 +147,7 @@ def _is_kitti(path: Path) -> bool:
 
 
 def _kitti(path: Path, size: Size | None) -> Rig:
-    """Return the grey and the colour pair of rectified images; poses are those of rectified camera 0."""
+    """Return the grey and the colour pair of rectified images; poses are rectified camera 0's."""
     from stereovox.sources.kitti.calibration import from_raw_files, read_calibration, read_values
 
     values = read_values(path)
@@ -160,7 +160,7 @@ def _kitti(path: Path, size: Size | None) -> Rig:
             size_entry = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
             pixels = size or ((int(size_entry[0]), int(size_entry[1])) if len(size_entry) == 2 else None)
             if pixels is None:
-                raise SourceError(f"{path}: does not tell the size of the images; give it with --size WIDTHxHEIGHT")
+                raise SourceError(f"{path}: does not contain the size of the images; give it with --size WIDTHxHEIGHT")
             T_cam0_left = inverse(calibration.offset_of(left))
             folders = f"image_0{left}/data", f"image_0{left + 1}/data"
             camera = calibration.camera(left, left + 1, pixels)

@@ -34,19 +34,19 @@ DISTORTIONS = {
     "kannalabrandt8": "fisheye",
     "kb4": "fisheye",
 }
-"""Our lens model of each distortion, by its name in small letters without `-`, `_` and blanks."""
+"""Our lens model of each distortion, by its name in lower case without `-`, `_` and blanks."""
 TOLERANCE = 5e-3
-"""Largest entry of abs(R^T R - I) that passes for rounding."""
+"""Largest entry of abs(R^T R - I) that counts as rounding."""
 UNSPACED = re.compile(r"^([ ]*[\w.]+):(?=[^\s:])", re.MULTILINE)
-"""OpenCV reads `data:[1, 2]`, which YAML takes for one word."""
+"""OpenCV reads `data:[1, 2]`, which YAML parses as one word."""
 
 
 class StereoCalibration(NamedTuple):
     """One pair of a calibration file, the left eye first.
 
-    eyes: the lenses of images that are to be rectified, or None. camera: what images were rectified to, or None.
-    T_body_left: (4, 4) maps the left optical frame (rectified where there is a camera) into the body's: the inertial
-        unit where the file has one, else the left eye. swapped: the file names the right eye first.
+    eyes: the lenses of images that must be rectified, or None. camera: the camera of rectified images, or None.
+    T_body_left: (4, 4) maps the left optical frame (rectified if there is a camera) into the body's: the inertial
+        unit if the file has one, else the left eye. swapped: the file lists the right eye first.
     """
 
     eyes: Eyes | None = None
@@ -60,7 +60,7 @@ def read_yaml(path: Path) -> Table:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Knows OpenCV's matrices, which are tables as well."""
+        """Reads OpenCV's matrices, which are tables too."""
 
     def matrix(loader: yaml.SafeLoader, node: Any) -> Any:
         return loader.construct_mapping(node, deep=True)
@@ -73,7 +73,7 @@ def read_yaml(path: Path) -> Table:
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
     except ValueError as error:
-        raise SourceError(f"{path}: no YAML that can be read ({str(error)[:120]}); correct it") from None
+        raise SourceError(f"{path}: not valid YAML ({str(error)[:120]}); correct it") from None
     if not isinstance(table, dict):
         raise SourceError(f"{path}: holds no table of a calibration; give the file that the calibration wrote")
     return table
@@ -82,7 +82,7 @@ def read_yaml(path: Path) -> Table:
 def of_eyes(a: Lens, b: Lens, T_a_b: Transform, bodies: Sequence[Transform | None] = (None, None)) -> StereoCalibration:
     """Return two eyes with the left one first, whatever their order in the file.
 
-    T_a_b: (4, 4) maps the optical frame of `b` into that of `a`. bodies: T_body_a and T_body_b, None: not known.
+    T_a_b: (4, 4) maps the optical frame of `b` into that of `a`. bodies: T_body_a and T_body_b, None: unknown.
     """
     swapped = bool(T_a_b[0, 3] < 0)
     if swapped:
@@ -99,7 +99,7 @@ def from_rectification(
     """Return the eyes of a rectification; the rectified frames differ by the baseline in the second's projection.
 
     lenses: of the left and the right eye. turns: (3, 3) each, raw into rectified coordinates. places: (3, 4) each, the
-    projections of rectified coordinates. Raises SourceError if these tell no baseline.
+    projections of rectified coordinates. Raises SourceError if these give no baseline.
     """
     shifts = []
     for P, eye in zip(places, ("left", "right"), strict=True):
@@ -107,7 +107,7 @@ def from_rectification(
             raise SourceError(f"the {eye} projection_matrix has no focal length; calibrate the stereo pair first")
         shifts.append(-P[0, 3] / P[0, 0])
     if shifts[0] == shifts[1]:
-        raise SourceError("both projection_matrix have one place, so there is no baseline; give left and right")
+        raise SourceError("both projection_matrix are equal, so there is no baseline; give left and right")
     T_left_right = np.eye(4)
     T_left_right[:3, :3] = turns[0].T @ turns[1]
     T_left_right[:3, 3] = turns[0].T @ [shifts[1] - shifts[0], 0, 0]
@@ -115,18 +115,18 @@ def from_rectification(
 
 
 def of_mounts(lenses: Sequence[Lens], mounts: Sequence[Transform]) -> StereoCalibration:
-    """Return two eyes, whose mounts T_body_camera (4, 4) are known, with the left one first."""
+    """Return two eyes with known mounts T_body_camera (4, 4), the left one first."""
     (a, b), (T_body_a, T_body_b) = lenses, mounts
     return of_eyes(a, b, inverse(T_body_a) @ T_body_b, (T_body_a, T_body_b))
 
 
 def lens_model(distortion: Any, what: str) -> str:
-    """Return our model of a named distortion; raises SourceError for one we do not have."""
+    """Return our model of a named distortion; raises SourceError if it is not supported."""
     name = re.sub(r"[-_ ]", "", distortion.lower()) if isinstance(distortion, str) else None
     if distortion is None or name in DISTORTIONS:
         return DISTORTIONS[name or ""]
     known = "radtan (plumb_bob), equidistant (fisheye), none"
-    raise SourceError(f"{what} = {shown(distortion)} is no lens we have ({known}); calibrate with one of them")
+    raise SourceError(f"{what} = {shown(distortion)} is not supported ({known}); calibrate with one of them")
 
 
 def lens_of(model: str, intrinsics: Sequence[float], distortion: Any, size: Sequence[float], eye: str) -> Lens:
@@ -151,7 +151,7 @@ def rigid(value: Any, what: str) -> Transform:
         given = np.append(given, (0.0, 0.0, 0.0, 1.0))
     T = matrix(given, what, 4, 4)
     if rigidity_error(T) > TOLERANCE:
-        raise SourceError(f"{what} is no rigid motion; give the file as the calibration wrote it")
+        raise SourceError(f"{what} is not a rigid motion; give the file as the calibration wrote it")
     return orthonormalise(T)
 
 
@@ -179,9 +179,9 @@ def matrix(value: Any, what: str, rows: int, columns: int) -> NDArray[np.float64
 
 
 def numbers(value: Any, what: str, count: int | None = None) -> list[float]:
-    """Return finite numbers, `count` of them where it is given; raises SourceError for anything else.
+    """Return finite numbers, `count` of them if given; raises SourceError for anything else.
 
-    Two with a blank or line end in place of the comma, which OpenCV reads, are two.
+    OpenCV accepts a blank or line end instead of a comma between two numbers; so does this.
     """
     if isinstance(value, list):
         value = [word for item in value for word in (item.split() if isinstance(item, str) else [item])]

@@ -30,15 +30,15 @@ CORRECTION = ("model", "coefficients", "provenance")
 MATRIX = "camera-intrinsics.txt"
 VGA = (640, 480)
 Standard = Intrinsics | Mapping[tuple[int, int], Intrinsics]
-"""Usual camera of a data set: of 640x480 images, or of each size (width, height)."""
+"""Default camera of a data set: of 640x480 images, or of each size (width, height)."""
 OTHER = "give the file of their own camera"
 
 
 def read_camera(path: Path) -> PinholeCamera:
     """Return the camera in `path`; raises SourceError naming file and key for anything wrong in it.
 
-    Keys: width, height, fx, fy, cx, cy in pixels, perhaps baseline in metres, perhaps a table [correction] with model
-    and coefficients as `DepthCorrection` has them, and a table [correction.provenance] of anything.
+    Keys: width, height, fx, fy, cx, cy in pixels; optionally baseline in metres, a table [correction] with model
+    and coefficients as in `DepthCorrection`, and a free table [correction.provenance].
     """
     table = read_table(path)
     try:
@@ -50,7 +50,7 @@ def read_camera(path: Path) -> PinholeCamera:
 def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = None, remarks: Sequence[str] = ()) -> str:
     """Return the text of a camera file, with `remarks` as comments at its top.
 
-    provenance: texts, numbers and lists of them that document the origin of the correction.
+    provenance: strings, numbers and lists of them that document the origin of the correction.
     """
     lines = [f"# {remark}" for remark in remarks]
     lines += [f"{key} = {toml_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
@@ -65,10 +65,10 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
 
 
 class FoundCamera(NamedTuple):
-    """Camera of a recording, and what its file says besides.
+    """Camera of a recording, and further contents of its file.
 
     notes: what was assumed, used or ignored. mirrored: its file has a negative fy, so the second axis of the camera of
-    its poses points up (see `rgbd.folder`). depth_scale: metres per unit of depth images, None if no file says.
+    its poses points up (see `rgbd.folder`). depth_scale: metres per unit of depth images, None if no file gives it.
     """
 
     camera: PinholeCamera
@@ -86,9 +86,9 @@ def find_camera(
 ) -> FoundCamera:
     """Find the camera of images of (width, height) = `size`.
 
-    The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
+    The first file found is used: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
     the `names`, in the order of `folders`, each as `read_camera_numbers` reads it. Without one, images get the
-    `default` of their size. `baseline` in metres applies where the file has none. Raises SourceError for a bad file, or
+    `default` of their size. `baseline` in metres applies if the file has none. Raises SourceError for a bad file, or
     if there is none and the images have another size.
     """
     places = [folders[0] / FILE, *(folder / name for folder in folders for name in names)]
@@ -108,14 +108,14 @@ def find_camera(
         )
     fx, fy, cx, cy = standard
     numbers = f"{fx:g} {fy:g} {cx:g} {cy:g}"
-    note = f"{folders[0]} has no {MATRIX}: fx fy cx cy are taken to be the usual {numbers}; else give --camera FILE"
+    note = f"{folders[0]} has no {MATRIX}: fx fy cx cy are assumed to be the usual {numbers}; else give --camera FILE"
     return FoundCamera(PinholeCamera(*size, fx, abs(fy), cx, cy, baseline), (note, *ignored), mirrored=fy < 0)
 
 
 def camera_in(path: Path, size: tuple[int, int], baseline: float | None) -> FoundCamera:
     """Return the camera in a camera.toml or another program's file, for images of (width, height) = `size`.
 
-    Raises SourceError for a bad file, and for a camera of other images.
+    Raises SourceError for a bad file, and if the camera has another size.
     """
     if path.suffix.lower() != ".toml":
         return _foreign(path, size, baseline)
@@ -124,7 +124,7 @@ def camera_in(path: Path, size: tuple[int, int], baseline: float | None) -> Foun
 
 
 def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
-    """Return `stream` with the camera in `file` (see `camera_in`); without a baseline there, the stream's own is kept.
+    """Return `stream` with the camera in `file` (see `camera_in`); if that has no baseline, the stream's own is kept.
 
     Raises SourceError for a bad file and for a camera with another number of pixels.
     """
@@ -132,15 +132,15 @@ def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
     if path.suffix.lower() != ".toml":
         found = _foreign(path, (own.width, own.height), own.baseline)
         if found.mirrored:
-            raise SourceError(f"{file}: fy is negative, which turns poses as well; give it behind the folder: ?camera=")
-        return WithCamera(stream, found.camera, (f"{file} is used in place of the recording's own camera",))
+            raise SourceError(f"{file}: fy is negative, which turns poses too; give it behind the folder: ?camera=")
+        return WithCamera(stream, found.camera, (f"{file} is used instead of the recording's own camera",))
     camera = read_camera(path)
     if (camera.width, camera.height) != (own.width, own.height):
         raise SourceError(
-            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
+            f"{file}: is for a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
             f"{own.width}x{own.height}; give the file of its own camera"
         )
-    note = f"{file} is used in place of the recording's own camera ({describe_correction(camera)})"
+    note = f"{file} is used instead of the recording's own camera ({describe_correction(camera)})"
     return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
 
 
@@ -181,14 +181,14 @@ def pinhole(
             raise SourceError(f"{name} = {number:g} must be positive")
     try:
         return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
-    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
+    except StereovoxError as error:  # it shows the whole camera; its last words name the fault
         numbers = " ".join(f"{number:g}" for number in intrinsics)
         raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
 
 
 def _camera(table: dict[str, Any]) -> PinholeCamera:
     if "pair" in table:
-        raise SourceError("is a rig file, no camera file; put it into the recording's folder as rig.toml")
+        raise SourceError("is a rig file, not a camera file; put it into the recording's folder as rig.toml")
     _check_keys(table, KEYS, "")
     for key, what in NEEDED.items():
         if key not in table:
@@ -208,7 +208,7 @@ def _correction(table: Any) -> DepthCorrection:
     _check_keys(table, CORRECTION, "correction.")
     model, numbers = table.get("model"), table.get("coefficients")
     if not isinstance(model, str) or not isinstance(numbers, list):
-        raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
+        raise SourceError("[correction] needs model, a string, and coefficients, a list of numbers")
     if not all(is_number(number) for number in numbers):
         raise SourceError(f"correction.coefficients {shown(numbers)} must be numbers")
     return DepthCorrection(model, tuple(map(float, numbers)))
@@ -231,14 +231,15 @@ def _of_size(path: Path, size: tuple[int, int], baseline: float | None) -> Pinho
     camera = read_camera(path)
     if (camera.width, camera.height) != size:
         raise SourceError(
-            f"{path}: is of a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
+            f"{path}: is for a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
             "replace or remove it"
         )
     return camera if camera.baseline else replace(camera, baseline=baseline)
 
 
 def _foreign(path: Path, size: tuple[int, int], baseline: float | None) -> FoundCamera:
-    """Return the camera in a file of another program, its numbers scaled where they are for images of another size."""
+    """Return the camera in a file of another program, with its numbers scaled if they are for images of another
+    size."""
     numbers = read_camera_numbers(path)
     fx, fy, cx, cy = numbers.intrinsics
     notes: tuple[str, ...] = ()

@@ -25,7 +25,7 @@ TEXT_NAMES = (
 )  # fmt: skip
 YAML_NAMES = ("camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "camera_info.yaml", "intrinsics.yaml")
 NAMES = (*TEXT_NAMES, *JSON_NAMES, *YAML_NAMES)
-"""Names by which a camera is looked for next to the images, in this order."""
+"""Names of camera files that are searched for next to the images, in this order."""
 KEYS = {
     "fx": ("fx", "fl_x", "focal_x", "focal_length_x"),
     "fy": ("fy", "fl_y", "focal_y", "focal_length_y"),
@@ -38,15 +38,15 @@ KEYS = {
     "matrix": ("intrinsic_matrix", "camera_matrix", "k", "depth_intrinsics", "intrinsics", "intrinsic",
                "m_calibrationdepthintrinsic"),
 }  # fmt: skip
-"""Names of each number in tables, in lower case and without what stands before a dot (`Camera.fx`)."""
+"""Names of each number in tables, in lower case and without the part before a dot (`Camera.fx`)."""
 
 
 class CameraNumbers(NamedTuple):
     """Numbers of a camera in a file of another program.
 
-    intrinsics: fx, fy, cx, cy in pixels; fy is negative where the image's second axis points up (ICL-NUIM).
-    size: (width, height) in pixels, None if the file does not say. depth_scale: metres per unit of its depth images,
-    None if the file does not say.
+    intrinsics: fx, fy, cx, cy in pixels; fy is negative if the image's second axis points up (ICL-NUIM).
+    size: (width, height) in pixels, None if the file lacks it. depth_scale: metres per unit of its depth images,
+    None if the file lacks it.
     """
 
     intrinsics: Intrinsics
@@ -57,7 +57,7 @@ class CameraNumbers(NamedTuple):
 def read_intrinsics(path: Path) -> Intrinsics:
     """Return fx, fy, cx, cy in pixels from a 3x3 or 4x4 matrix or from these four numbers; `#` starts a comment.
 
-    Raises SourceError naming the file for anything else, including skew: such a camera is no plain pinhole.
+    Raises SourceError naming the file for anything else, including skew: such a camera is not a plain pinhole.
     """
     return _of_numbers(path, _numbers(path)).intrinsics
 
@@ -70,10 +70,10 @@ def read_camera_numbers(path: Path) -> CameraNumbers:
             cameras.txt), JSON (Open3D, Replica, nerfstudio) or YAML (ROS camera_info, OpenCV, ORB-SLAM).
 
     Returns:
-        The camera's numbers, and size and depth unit where the file says them.
+        The camera's numbers, and size and depth unit if the file has them.
 
-    Raises:
-        SourceError: One line with the file and what is wrong.
+        Raises:
+            SourceError: One line with the file and the problem.
     """
     if path.suffix.lower() == ".json":
         return _of_table(path, read_json(path))
@@ -93,7 +93,7 @@ def read_camera_numbers(path: Path) -> CameraNumbers:
 def scaled(intrinsics: Sequence[float], x: float, y: float | None = None) -> Intrinsics:
     """Return fx, fy, cx, cy in pixels of images `x` times as wide and `y` times as high (None: as `x`).
 
-    Pixel centres are at whole numbers, so the edge of the first pixel lies at -0.5.
+    Pixel centres are at whole numbers, so the edge of the first pixel is at -0.5.
     """
     fx, fy, cx, cy = intrinsics
     y = x if y is None else y
@@ -101,7 +101,7 @@ def scaled(intrinsics: Sequence[float], x: float, y: float | None = None) -> Int
 
 
 def metres_per_unit(scale: float) -> float:
-    """Return metres per unit of a depth scale in either notation: 1000 and 0.001 both stand for millimetres."""
+    """Return metres per unit of a depth scale in either notation: 1000 and 0.001 both mean millimetres."""
     return 1 / scale if scale > 1 else scale
 
 
@@ -109,7 +109,7 @@ def _of_numbers(path: Path, numbers: Sequence[float]) -> CameraNumbers:
     if len(numbers) == 6:
         width, height, *numbers = numbers
         if not (1 <= width < 1e5 and 1 <= height < 1e5):
-            raise SourceError(f"{path}: width {width:g} and height {height:g} are no numbers of pixels; correct them")
+            raise SourceError(f"{path}: width {width:g} and height {height:g} are not numbers of pixels; correct them")
         return CameraNumbers(_four(path, numbers), (int(width), int(height)))
     return CameraNumbers(_four(path, numbers))
 
@@ -117,7 +117,7 @@ def _of_numbers(path: Path, numbers: Sequence[float]) -> CameraNumbers:
 def _four(path: Path, numbers: Sequence[float]) -> Intrinsics:
     if len(numbers) == 16 and list(numbers[12:]) == [0, 0, 0, 1]:
         numbers = [numbers[k] for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
-    if len(numbers) == 12 and list(numbers[9:]) == [0, 0, 1]:  # its last line twice
+    if len(numbers) == 12 and list(numbers[9:]) == [0, 0, 1]:  # its last line is doubled
         numbers = numbers[:9]
     if len(numbers) == 12 and numbers[3] == numbers[7] == numbers[11] == 0:
         numbers = [numbers[k] for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
@@ -133,7 +133,7 @@ def _four(path: Path, numbers: Sequence[float]) -> Intrinsics:
 
 
 def _of_table(path: Path, table: Any) -> CameraNumbers:
-    found = dict(reversed(list(_leaves(table))))  # of several cameras the first
+    found = dict(reversed(list(_leaves(table))))  # the first of several cameras
 
     def value(name: str) -> Any:
         return next((found[key] for key in KEYS[name] if key in found), None)
@@ -143,7 +143,7 @@ def _of_table(path: Path, table: Any) -> CameraNumbers:
     if not all(map(is_number, four)):
         matrix = value("matrix")
         if not isinstance(matrix, list):
-            raise SourceError(f"{path}: tells no fx, fy, cx, cy; give the camera's own file, or {FORMS}")
+            raise SourceError(f"{path}: has no fx, fy, cx, cy; give the camera's own file, or {FORMS}")
         four = list(_four(path, matrix))
     if not all(map(math.isfinite, four)):
         raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
@@ -160,7 +160,7 @@ def _of_table(path: Path, table: Any) -> CameraNumbers:
 def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Yield names and values of a nested table; a list of numbers, or of lists of them, is one value."""
     if isinstance(value, dict):
-        if is_number(value.get("rows")) and isinstance(value.get("data"), list):  # ROS and OpenCV write matrices so
+        if is_number(value.get("rows")) and isinstance(value.get("data"), list):  # a matrix of ROS or OpenCV
             yield key, value["data"]
         for name, inner in value.items():
             yield from _leaves(inner, str(name).lower().rpartition(".")[2])
@@ -190,7 +190,7 @@ def _of_colmap(path: Path, words: Sequence[str]) -> CameraNumbers:
 
 
 def _assignments(text: str) -> Iterator[tuple[str, Any]]:
-    """Yield the names and numbers of lines `key = 1 2 3`; words that are no numbers are left out."""
+    """Yield the names and numbers of lines `key = 1 2 3`; lines with other words are skipped."""
     for line in text.splitlines():
         key, equals, rest = line.partition("=")
         try:

@@ -27,9 +27,9 @@ TOPICS = {"cloud": POINT_CLOUD, "scan": LASER_SCAN}
 class Options(LidarOptions):
     """Options of `LidarOptions`, and:
 
-    cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) in place of
-    these. poses: topic of the poses of the lidar; without it those of /tf. world_frame: as for depth images. deskew: 0
-    to take the points of a cloud as measured at once, though they have times.
+    cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) to use
+    instead. poses: topic of the lidar's poses; default: /tf. world_frame: as for depth images. deskew: 0
+    to treat the points of a cloud as measured at once although they have times.
     """
 
     cloud: str = ""
@@ -40,15 +40,15 @@ class Options(LidarOptions):
 
 
 class BagClouds(CloudSource):
-    """Clouds, or 2-D scans, of one topic of a bag, with the poses that /tf or another topic tells.
+    """Clouds, or 2-D scans, of one topic of a bag, with poses from /tf or another topic.
 
     where: the file, with `?cloud=/topic` or `?scan=/topic`; see `Options`.
-    Points: fields x, y and z. Where they have times (`time`, `t`, `timestamp`, `offset_time`) they are straightened by
+    Points: fields x, y and z. If they have times (`time`, `t`, `timestamp`, `offset_time`) they are deskewed with
         the poses of the sensor (`deskewed`). Of a scan: each beam's end; beams without an echo (+inf) are free up to
         its `range_max`.
     Pose: of the frame that the messages name, at their times.
     Faults: `unreadable`, `no_pose`, `bad_pose_file`.
-    Raises SourceError for files that cannot be used, topics that do not exist or hold something else, and bad options.
+    Raises SourceError for unusable files, topics that do not exist or have another type, and bad options.
     """
 
     layout = "clouds of a bag (drive.bag?cloud=/topic) or its 2-D scans (?scan=/topic)"
@@ -59,7 +59,7 @@ class BagClouds(CloudSource):
         no_others(where, others, Options)
         given = {key: topic for key in TOPICS if (topic := getattr(self._options, key))}
         if len(given) != 1:
-            raise SourceError(f"{where}: says {' and '.join(given)}; give one of ?cloud= and ?scan=")
+            raise SourceError(f"{where}: has {' and '.join(given)}; give one of ?cloud= and ?scan=")
         ((key, topic),) = given.items()
         self._file = open_bag(Path(path))
         check_topic(self._file, topic, (TOPICS[key],), key)
@@ -72,7 +72,7 @@ class BagClouds(CloudSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a bag of which clouds or scans are asked for."""
+        """Return whether `where` is a bag with an option for clouds or scans."""
         file = file_part(where)
         asked = [word.partition("=")[0] for word in where[len(file) :].lstrip("?").split("&")]
         return bool(set(asked) & set(TOPICS)) and bool(suffix_of(file))
@@ -89,7 +89,7 @@ class BagClouds(CloudSource):
         return self._scans.name(i)
 
     def cloud(self, i: int) -> Cloud:
-        """Return cloud `i`, straightened where its points have times."""
+        """Return cloud `i`, deskewed if its points have times."""
         message = self._scans.read(i)
         T = self._pose_at(message.stamp_ns)
         if isinstance(message, LaserScan):
@@ -112,7 +112,7 @@ class BagClouds(CloudSource):
         return self._poses.poses.off_ns(stamp_ns) if isinstance(self._poses, TurnedTf) else 0
 
     def _note_of_times(self) -> tuple[str, ...]:
-        """Return a note where clouds are taken as measured at once, though nothing says so."""
+        """Return a note if clouds are assumed to be measured at once."""
         if not self._scans.is_cloud or not len(self._scans):
             return ()
         try:
@@ -129,7 +129,7 @@ def cloud_of_scan(scan: LaserScan, options: LidarOptions | None = None) -> Cloud
 
     Args:
         scan: The scan; +inf is nothing up to `range_max`, less four sigma: nearer surfaces may be measured beyond it.
-        options: Say how exact its ranges are.
+        options: The noise of its ranges.
     """
     angles = scan.angle_min + scan.angle_step * np.arange(len(scan.ranges))
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])

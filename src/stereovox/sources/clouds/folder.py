@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders with one file for each cloud, and a file of poses."""
+"""Folders with one file per cloud, and a file of poses."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ TIMES = ("times.txt", "timestamps.txt")
 NANOSECONDS = re.compile(r"\d{16,19}")
 SECONDS = re.compile(r"\d{1,10}\.\d+")
 NUMBERED = re.compile(r"\d{2}$|^\d+$")
-"""How the names of KITTI's clouds end; points3D.bin is none."""
+"""Endings of the names of KITTI's clouds; points3D.bin is not one."""
 RATE_HZ = 10.0
-"""Clouds a second where nothing says when they were taken: that of most spinning lidars."""
+"""Default clouds per second, if no times are given: the rate of most spinning lidars."""
 
 
 @dataclass(frozen=True)
 class Options(LidarOptions):
     """Options of `LidarOptions`, and:
 
-    poses: file of the poses, of any form (see `rgbd.pose_files`), in place of the folder's own. axes: those of the
-    posed body if it is not the lidar's (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds a
-    second, where they have no times.
+    poses: file of the poses, of any form (see `rgbd.pose_files`), instead of the folder's own. axes: axes of the
+    posed body if it is not the lidar (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds per
+    second, if they have no times.
     """
 
     poses: str = ""
@@ -62,13 +62,13 @@ class CloudFolder(CloudSource):
     """Clouds in `.pcd`, `.ply` or KITTI's `.bin` files, with the poses of the lidar.
 
     where: the folder, with the files in it or in one of `clouds`, `scans`, `velodyne`, `lidar`, `pcd`, `ply`, `points`;
-        see `Options` for what may follow.
-    Poses: `poses.txt` or the like, T_world_lidar in any form; interpolated where they have times, else one for each
+        `Options` may follow.
+    Poses: `poses.txt` or the like, T_world_lidar in any form; interpolated if they have times, else one for each
         cloud.
-    Times: of the files' names, where these are seconds with a fraction or nanoseconds; else lines of seconds in
-        `times.txt`; else 10 clouds a second, which a note tells.
+    Times: from the files' names, if these are seconds with a fraction or nanoseconds; else lines of seconds in
+        `times.txt`; else 10 clouds a second, with a note.
     Faults: `unreadable`, `no_pose`, `bad_pose_file`.
-    Raises SourceError if there is no cloud, or what is said of times and poses does not fit.
+    Raises SourceError if there is no cloud, or times and poses do not fit.
     """
 
     layout = "a folder of clouds (.pcd, .ply, .bin) with poses of the lidar (poses.txt)"
@@ -84,7 +84,7 @@ class CloudFolder(CloudSource):
         self.name, self.lidar, self.notes = folder.resolve().name, options.lidar, ()
         self._files = _clouds_in(folder)
         if not self._files:
-            raise SourceError(f"{folder}: has no clouds ({', '.join(ENDINGS)}); give a folder that has some")
+            raise SourceError(f"{folder}: has no clouds ({', '.join(ENDINGS)}); give a folder with clouds")
         timed = sorted(zip(self._times(folder, options.fps), self._files, strict=True), key=lambda one: one[0])
         self._stamps, self._files = [stamp_ns for stamp_ns, _ in timed], [path for _, path in timed]
         poses = _poses_in(folder) if not options.poses else file_of(options.poses, folder)
@@ -97,7 +97,7 @@ class CloudFolder(CloudSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with clouds and poses, or says where its poses are."""
+        """Return whether `where` is a folder with clouds and poses, or names its poses."""
         folder = folder_part(where)
         if not os.path.isdir(folder):
             return False
@@ -122,7 +122,7 @@ class CloudFolder(CloudSource):
         return Cloud(points, T, self._stamps[i], self.lidar, name=str(path))
 
     def _times(self, folder: Path, fps: float) -> list[int]:
-        """Return the times of all clouds; those in names need not ascend: 7.5 comes behind 7.25, and after it."""
+        """Return the times of all clouds; times in names need not ascend: 7.5 sorts behind 7.25."""
         stems = [path.stem for path in self._files]
         if not fps and all(NANOSECONDS.fullmatch(stem) and int(stem) < MAX_INT for stem in stems):
             return [int(stem) for stem in stems]
@@ -133,7 +133,7 @@ class CloudFolder(CloudSource):
             return self._listed(listed)
         rate = fps or RATE_HZ
         if not fps:
-            self.notes = (f"{self.name}: nothing says when clouds were taken; {rate:g} a second (?fps=)",)
+            self.notes = (f"{self.name}: clouds have no times; assuming {rate:g} a second (?fps=)",)
         return [round(1e9 * i / rate) for i in range(len(stems))]
 
     def _listed(self, path: Path) -> list[int]:
@@ -143,7 +143,7 @@ class CloudFolder(CloudSource):
             raise SourceError(f"{path}: {error}; write a time in seconds in each line") from None
         if len(stamps) != len(self._files) or any(b <= a for a, b in pairwise(stamps)):
             raise SourceError(
-                f"{path}: has {len(stamps)} times of {len(self._files)} clouds; write one for each, ascending"
+                f"{path}: has {len(stamps)} times for {len(self._files)} clouds; write one for each, ascending"
             )
         return stamps
 
@@ -151,20 +151,21 @@ class CloudFolder(CloudSource):
 def _measured(path: Path) -> NDArray[np.float64]:
     """Return the points of a `.pcd` or `.ply` (N, 3); raises FrameRefused `unreadable`.
 
-    Where a `.pcd` says that they were seen from elsewhere, rays from its origin would free what nobody saw.
+    If a `.pcd` has another viewpoint, rays from its origin would clear space that was never seen.
     """
     try:
         found = read_points(path)
     except MapFileError as error:
         raise FrameRefused("unreadable", str(error)) from None
     if found.turned:
-        cure = "write VIEWPOINT 0 0 0 1 0 0 0 where points are in the lidar's own frame, else move them into it"
+        cure = "write VIEWPOINT 0 0 0 1 0 0 0 if points are in the lidar's own frame, else move them into it"
         raise FrameRefused("unreadable", f"{path}: its VIEWPOINT moves or turns the lidar; {cure}")
     return found.xyz
 
 
 def _clouds_in(folder: Path) -> list[Path]:
-    """Return the clouds of a folder in the order of their names' numbers; of the first subfolder that has some."""
+    """Return the clouds of a folder, or of its first subfolder with clouds, in the order of the numbers in their
+    names."""
     for place in (folder / name for name in SUBFOLDERS):
         if place.is_dir():
             found = [place / name for name in file_names(place) if _is_cloud(name, place == folder)]
@@ -174,7 +175,7 @@ def _clouds_in(folder: Path) -> list[Path]:
 
 
 def _is_cloud(name: str, top: bool) -> bool:
-    """Return whether a file is a cloud by its name; in the folder itself a `.bin` may be anything unless numbered."""
+    """Return whether a file is a cloud by its name; in the folder itself a `.bin` must be numbered."""
     path = Path(name)
     ending = path.suffix.lower()
     return ending in ENDINGS and not (top and ending == ".bin" and not NUMBERED.search(path.stem))

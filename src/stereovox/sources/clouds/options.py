@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of recordings with clouds, and what they all have in common."""
+"""Options common to recordings with clouds."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ OptionsT = TypeVar("OptionsT", bound="LidarOptions")
 
 @dataclass(frozen=True)
 class LidarOptions:
-    """What may stand behind the name of any recording with clouds, as in `scans?range_max=80&sigma=0.03`.
+    """Options behind the name of any recording with clouds, as in `scans?range_max=80&sigma=0.03`.
 
     sigma: standard deviation of a range in metres (0: 0.02). range_min: metres below which points are left out, such
-    as those on the vehicle (-1: 0.5). range_max: metres beyond which a point is no surface (0: no limit).
+    as points on the vehicle (-1: 0.5). range_max: metres beyond which a point is no surface (0: no limit).
     """
 
     sigma: float = 0.0
@@ -46,7 +46,7 @@ class LidarOptions:
 
 
 def options_of(where: str, start: int, kind: type[OptionsT]) -> tuple[OptionsT, dict[str, str]]:
-    """Return the options of a class that stand in `where` from a place on, and all others as they are.
+    """Return the options of a class found in `where` from `start` on, and all others unparsed.
 
     Raises SourceError for bad ones.
     """
@@ -55,14 +55,14 @@ def options_of(where: str, start: int, kind: type[OptionsT]) -> tuple[OptionsT, 
         _, given = parameters.split(f"name{where[start:]}")
         ours = {key: text for key, text in given.items() if key in known}
         options = kind(**parameters.typed(ours, known))
-        options.lidar  # noqa: B018 - its numbers are checked
+        options.lidar  # noqa: B018 - this checks its numbers
         return options, {key: text for key, text in given.items() if key not in known}
     except SourceError as error:
         raise SourceError(f"{where}: {error}") from None
 
 
 def no_others(where: str, others: dict[str, str], kind: type[LidarOptions]) -> None:
-    """Raise SourceError if there are options that a class does not know."""
+    """Raise SourceError if there are options unknown to a class."""
     try:
         parameters.typed(others, {field.name: field.default for field in fields(kind)})
     except SourceError as error:
@@ -73,8 +73,8 @@ class CloudSource(Source, Protocol):
     """A recording of clouds.
 
     Attributes:
-        lidar: What their ranges can be trusted for.
-        camera: A camera that looks forward, for pictures.
+        lidar: Range limits and noise.
+        camera: A camera that points forward, for pictures.
     """
 
     lidar: Lidar
@@ -89,11 +89,11 @@ class CloudSource(Source, Protocol):
         ...
 
     def file(self, i: int) -> str | Path:
-        """Return what it comes from, for messages."""
+        """Return its origin, for messages."""
         ...
 
     def frame(self, i: int) -> Cloud:
-        """Return cloud `i`; it has no points, and a pose of NaN, where it has a `fault`."""
+        """Return cloud `i`; if it has a `fault`, it has no points and a pose of NaN."""
         i = range(len(self))[i]
         try:
             return self.cloud(i)

@@ -22,18 +22,18 @@ LAYOUTS = (KittiRaw, KittiTracking, KittiOdometry)
 
 @dataclass(frozen=True)
 class Options(LidarOptions):
-    """Options of `LidarOptions`, and `sensor`: `velodyne` or `both`; all others are those of the recording."""
+    """Options of `LidarOptions`, and `sensor`: `velodyne` or `both`; all others are the recording's."""
 
     sensor: str = ""
 
 
 class Velodyne(CloudSource):
-    """The clouds of a KITTI raw drive, a tracking or an odometry sequence, as they were measured.
+    """The clouds of a KITTI raw drive, a tracking or an odometry sequence, as measured.
 
     where: as for the recording's images, with `?sensor=velodyne`, other options after an `&`.
-    Points: those of the `.bin` files; they have no times, so they are taken as measured at once.
-    World, poses and times: those of the recording. Faults: `missing_file`, `unreadable`, `no_pose`, `bad_pose_file`.
-    Raises SourceError as for the recording, and where it has no lidar.
+    Points: from the `.bin` files; they have no times, so each cloud counts as measured at once.
+    World, poses and times: the recording's. Faults: `missing_file`, `unreadable`, `no_pose`, `bad_pose_file`.
+    Raises SourceError as for the recording, and if it has no lidar.
 
     Attributes:
         drive: The recording.
@@ -56,7 +56,7 @@ class Velodyne(CloudSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` asks for the lidar of a KITTI recording."""
+        """Return whether `where` requests the lidar of a KITTI recording."""
         folder = folder_part(where)
         return _asked(where) == SENSOR and any(kind.recognises(folder) for kind in LAYOUTS)
 
@@ -80,9 +80,9 @@ class Velodyne(CloudSource):
 
 
 class CameraAndVelodyne(Source):
-    """The images and the clouds of such a recording, in turn: both make one map.
+    """The images and the clouds of such a recording, alternating: both make one map.
 
-    where: as for `Velodyne`, with `?sensor=both`. The first of each two frames is a stereo pair, the second the cloud
+    where: as for `Velodyne`, with `?sensor=both`. Each stereo pair is followed by the cloud
     of the same time.
     """
 
@@ -99,7 +99,7 @@ class CameraAndVelodyne(Source):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` asks for both."""
+        """Return whether `where` requests both."""
         folder = folder_part(where)
         return _asked(where) == BOTH and any(kind.recognises(folder) for kind in LAYOUTS)
 

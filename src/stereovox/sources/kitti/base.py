@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the KITTI layouts have in common: a rectified pair, a lidar, and poses of rectified camera 0."""
+"""Common parts of the KITTI layouts: a rectified pair, a lidar, and poses of rectified camera 0."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class CameraPoses(Protocol):
 class KittiSource(Source, ABC):
     """Frames of a stereo pair with a lidar scan each, in one of KITTI's layouts.
 
-    A layout sets `name`, `calibration`, `poses`, `eyes` (camera numbers left and right) and `camera`, and says where
-    the files of each frame lie. World: see `FramePoses`. Pose of a frame: that of the rectified left camera in use.
-    A file that cannot be used becomes a frame with a `fault`: those of `read_picture_png`, `no_pose`, `bad_pose_file`.
-    Why a pixel has no value is found out by matching (see `depth.stereo`).
+    A layout sets `name`, `calibration`, `poses`, `eyes` (camera numbers left and right) and `camera`, and locates
+    the files of each frame. World: see `FramePoses`. Pose of a frame: the rectified left camera in use.
+    An unusable file gives a frame with a `fault`: one of `read_picture_png`, `no_pose`, `bad_pose_file`.
+    Reasons of invalid pixels come from matching (see `depth.stereo`).
     """
 
     calibration: KittiCalibration
@@ -69,7 +69,7 @@ class KittiSource(Source, ABC):
         return self.calibration
 
     def frame(self, i: int) -> StereoFrame:
-        """Return frame `i`; images are (0, 0) and the pose NaN where the frame has a `fault`."""
+        """Return frame `i`; images are (0, 0) and the pose is NaN if the frame has a `fault`."""
         i = range(len(self))[i]
         paths, stamp_ns, pair = self.images(i), self.stamp_ns(i), self.pair(i)
         try:
@@ -84,7 +84,7 @@ class KittiSource(Source, ABC):
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if there is none."""
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if it is missing."""
         return self.viewpoint(i).T_world_camera
 
     def viewpoint(self, i: int) -> Viewpoint:
@@ -99,7 +99,7 @@ class KittiSource(Source, ABC):
         return self.calibration.T_cam0_velo is not None and os.path.isdir(self.velodyne(0).parent)
 
     def scan(self, i: int) -> LidarScan | None:
-        """Return the scan of frame `i`; None, and FrameRefused, as `LidarSource` says."""
+        """Return the scan of frame `i`; None or FrameRefused as in `LidarSource`."""
         i = range(len(self))[i]
         T_cam0_velo = self.calibration_of(i).T_cam0_velo
         if not self.has_lidar or T_cam0_velo is None:
@@ -107,7 +107,7 @@ class KittiSource(Source, ABC):
         return LidarScan(read_velodyne(self.velodyne(i)), self.poses.at(i) @ T_cam0_velo, self.stamp_ns(i))
 
     def boxes(self, i: int) -> tuple[Box, ...]:
-        """Return the annotated objects of frame `i`: none, where the layout has no annotations."""
+        """Return the annotated objects of frame `i`: none if the layout has no annotations."""
         range(len(self))[i]
         return ()
 
@@ -138,9 +138,9 @@ def time_lines(path: Path, whose: str) -> list[str]:
 
 
 def choose_pair(where: Path, camera: str, present: dict[str, bool]) -> tuple[int, int]:
-    """Return the camera numbers of the pair that `camera` names, or of the first present one (grey) for ''.
+    """Return the camera numbers of the pair named `camera`, or of the first present one (grey) for ''.
 
-    Raises SourceError for an unknown name or a pair that is not there.
+    Raises SourceError for an unknown name or a missing pair.
     """
     if camera and camera not in PAIRS:
         raise SourceError(f"{where}: camera={camera}{did_you_mean(camera, PAIRS)}")
@@ -152,6 +152,6 @@ def choose_pair(where: Path, camera: str, present: dict[str, bool]) -> tuple[int
 
 
 def numbers_in(folder: Path, pattern: re.Pattern[str]) -> list[str]:
-    """Return the numbers (first group of `pattern`) of the files in `folder`, in ascending order, as written."""
+    """Return the numbers (first group of `pattern`) of the files in `folder`, ascending, as written."""
     names = file_names(folder) if os.path.isdir(folder) else []
     return sorted({match[1] for name in names if (match := pattern.fullmatch(name))}, key=int)

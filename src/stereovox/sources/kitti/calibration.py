@@ -19,16 +19,16 @@ from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error
 
 CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
 ROUNDING = 1e-3
-"""How far the printed rotations may be from rigid ones."""
+"""Largest rigidity error of the printed rotations."""
 Values = Mapping[str, list[float]]
 
 
 @dataclass(frozen=True, eq=False)
 class KittiCalibration:
-    """The rectified cameras 0 to 3 and where lidar and inertial unit sit.
+    """The rectified cameras 0 to 3 and the mounts of lidar and inertial unit.
 
     Camera 0, rectified, is the frame of reference. projections: (3, 4) by camera number, pixels from points in
-    rectified camera 0. T_cam0_velo, T_velo_imu: (4, 4), None if the recording does not tell.
+    rectified camera 0. T_cam0_velo, T_velo_imu: (4, 4), None if the recording lacks them.
     where: file or folder it was read from, for messages.
     """
 
@@ -40,13 +40,13 @@ class KittiCalibration:
     def camera(self, left: int, right: int, size: tuple[int, int]) -> PinholeCamera:
         """Return the rectified left camera of a pair for images of (width, height), with the pair's baseline.
 
-        Raises SourceError if there is no such pair or its numbers make none.
+        Raises SourceError if there is no such pair or its numbers are invalid.
         """
         P = self._projection(left)
         baseline = (self.offset_of(left) - self.offset_of(right))[0, 3]
         if not baseline > 0:
             where = f"P{left} and P{right} give a baseline of {baseline:g} m"
-            raise SourceError(f"{self.where}: {where}; the second camera must stand right of the first")
+            raise SourceError(f"{self.where}: {where}; the second camera must be to the right of the first")
         try:
             return PinholeCamera(*size, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]), float(baseline))
         except StereovoxError as error:
@@ -70,7 +70,7 @@ class KittiCalibration:
 def read_raw_calibration(folder: Path) -> KittiCalibration:
     """Return the calibration in the three files of KITTI raw in a date folder; raises SourceError.
 
-    Those of lidar and inertial unit may be missing.
+    The files of lidar and inertial unit may be missing.
     """
     return from_raw_files(folder / CAM_TO_CAM, folder / VELO_TO_CAM, folder / IMU_TO_VELO)
 
@@ -85,9 +85,9 @@ def from_raw_files(cameras: Path, lidar: Path, imu: Path) -> KittiCalibration:
 
 
 def read_calibration(path: Path) -> KittiCalibration:
-    """Return what a single file says: that of KITTI tracking and object data, or of odometry (`Tr`)."""
+    """Return the calibration in a single file: KITTI tracking and object data, or odometry (`Tr`)."""
     values = read_values(path)
-    if "Tr" in values:  # odometry: straight into rectified camera 0
+    if "Tr" in values:  # odometry: directly into rectified camera 0
         return KittiCalibration(_projections(values, "P", path), _rigid(values, "Tr", path), None, str(path))
     rectify = next((_rotation(values, key, path) for key in ("R_rect", "R0_rect") if key in values), None)
     T_cam_velo = next((_rigid(values, key, path) for key in ("Tr_velo_cam", "Tr_velo_to_cam") if key in values), None)
@@ -97,16 +97,16 @@ def read_calibration(path: Path) -> KittiCalibration:
 
 
 def read_values(path: Path) -> dict[str, list[float]]:
-    """Return the numbers behind each name; the colon may be missing, and what is no number (a date) is left out.
+    """Return the numbers behind each name; the colon may be missing; other values (a date) are left out.
 
-    Raises SourceError if the file cannot be read or holds nothing of the kind.
+    Raises SourceError if the file cannot be read or has no such line.
     """
     try:
         lines = read_text(path).splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put the data set's calibration there") from None
     except UnicodeDecodeError:
-        raise SourceError(f"{path}: is no text file; put the data set's calibration there") from None
+        raise SourceError(f"{path}: is not a text file; put the data set's calibration there") from None
     values = {}
     for name, *words in filter(None, map(str.split, lines)):
         try:
@@ -125,7 +125,9 @@ def _projections(values: Values, prefix: str, path: Path) -> dict[int, NDArray[n
         if name in values:
             P = np.array(_numbers(values, name, 12, path)).reshape(3, 4)
             if P[0, 1] or P[1, 0] or not np.array_equal(P[2, :3], [0, 0, 1]) or min(P[0, 0], P[1, 1]) <= 0:
-                raise SourceError(f"{path}: {name} is no projection of a rectified camera; put the original file back")
+                raise SourceError(
+                    f"{path}: {name} is not a projection of a rectified camera; put the original file back"
+                )
             found[number] = P
     return found
 
@@ -154,7 +156,7 @@ def _rigid_file(path: Path) -> Transform | None:
 
 def _checked(T: Transform, name: str, path: Path) -> Transform:
     if rigidity_error(T) > ROUNDING:
-        raise SourceError(f"{path}: {name} is no rotation; put the original file back")
+        raise SourceError(f"{path}: {name} is not a rotation; put the original file back")
     return orthonormalise(T)
 
 

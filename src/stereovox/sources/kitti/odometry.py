@@ -33,14 +33,14 @@ class KittiOdometry(KittiSource):
     """A folder `sequences/00` with image_0 and image_1 (grey) or image_2 and image_3 (colour), calib.txt, times.txt.
 
     where: the folder, or with options `sequences/00?camera=colour&poses=FILE`:
-        camera: `grey` or `colour`; without it grey where there are such images.
-        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it `poses/00.txt` next to
-            `sequences`, which the benchmark publishes for 00 to 10 only.
-        axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
-        fps: frames a second if there is no times.txt, 10 without it.
-    posed: without it poses are not looked for, and are NaN.
-    Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are untwisted there.
-    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
+            camera: `grey` or `colour`; default: grey if there are such images.
+            poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`); default: `poses/00.txt` next to
+                `sequences`, which the benchmark publishes for 00 to 10 only.
+            axes: of the posed camera, `optical` (default), `opengl` or `ros`. invert: 1 for world to camera.
+            fps: frames a second if there is no times.txt; default 10.
+        posed: if False, poses are not searched for, and are NaN.
+        Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are already deskewed.
+        World and faults: see `KittiSource`. Raises SourceError if a whole part is missing.
     """
 
     layout = "a KITTI odometry sequence (sequences/00 with image_0, image_1, calib.txt and times.txt)"
@@ -65,7 +65,7 @@ class KittiOdometry(KittiSource):
 
     @classmethod
     def depth_only(cls, where: str) -> KittiOdometry:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return cls(where, posed=False)
 
     @classmethod

@@ -19,11 +19,11 @@ from stereovox.sources.rgbd.pose_files import in_optical_axes
 from stereovox.sources.rigs.rig_options import poses_of_images
 
 EARTH_RADIUS = 6378137.0
-"""Metres, as KITTI's own development kit has it."""
+"""Metres, the value of KITTI's own development kit."""
 OXTS_FIELDS = 6
-"""Of the 30 numbers of an oxts packet the first six count: latitude, longitude, altitude, roll, pitch, yaw."""
+"""Numbers used of an oxts packet's 30: latitude, longitude, altitude, roll, pitch, yaw."""
 OXTS_MOTION = (17, 18, 19, 11, 12, 13)
-"""Places of wx wy wz and of ax ay az in a packet."""
+"""Positions of wx wy wz and of ax ay az in a packet."""
 UPRIGHT = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """T_world_optical: turns optical axes (x right, y down, z forward) into the world's (x forward, y left, z up)."""
 UPRIGHT.setflags(write=False)
@@ -31,11 +31,11 @@ ROUNDING = 5e-3
 
 
 class FramePoses:
-    """The pose of rectified camera 0 for each frame, in a world that is that camera of the first frame, upright.
+    """The pose of rectified camera 0 for each frame, in a world defined by that camera at the first frame, upright.
 
-    T_any_cam0: for each frame (4, 4) in any world, or what is wrong with it in one line. World of what `at` returns:
+    T_any_cam0: for each frame (4, 4) in any world, or its fault in one line. World of the result of `at`:
     z up, x forward, y left and origin at camera 0 of the first frame that has a pose.
-    Raises SourceError if not one frame has a pose.
+    Raises SourceError if no frame has a pose.
     """
 
     def __init__(self, T_any_cam0: Sequence[Transform | str], where: str):
@@ -61,7 +61,7 @@ class FramePoses:
 
 
 class StandingPoses:
-    """The pose of recordings of single moments: camera 0 at the origin of an upright world, always."""
+    """The pose of independent scenes: always camera 0 at the origin of an upright world."""
 
     def at(self, i: int) -> Transform:
         """Return T_world_cam0 (4, 4), the same for every frame."""
@@ -71,8 +71,8 @@ class StandingPoses:
 def read_pose_file(path: Path, frames: int) -> FramePoses:
     """Return the poses in a file of `frames` lines, each 12 numbers: the 3x4 matrix T_world_cam0, row by row.
 
-    Fewer lines leave the last frames without a pose. Raises SourceError for a file that cannot be read or
-    has more lines than there are frames: it is then that of another recording.
+    Fewer lines leave the last frames without a pose. Raises SourceError if the file cannot be read or
+    has more lines than there are frames, and so belongs to another recording.
     """
     lines = _frame_lines(path, frames)
     return FramePoses([_pose(line, f"{path}:{n}") for n, line in enumerate(lines, 1)], str(path))
@@ -81,8 +81,8 @@ def read_pose_file(path: Path, frames: int) -> FramePoses:
 def read_named_poses(path: Path, stamps_ns: Sequence[int], axes: str = "", inverted: bool = False) -> FramePoses:
     """Return the poses of camera 0 in a file or folder that an option names, one for each of the times `stamps_ns`.
 
-    Twelve numbers a line are read as `read_pose_file` does, any other form as `poses_of_images`. axes: of the posed
-    camera, `optical` if it is empty. inverted: they map the world into the camera. Raises SourceError.
+    Twelve numbers a line are read by `read_pose_file`, any other form by `poses_of_images`. axes: of the posed
+    camera, `optical` if empty. inverted: they map the world into the camera. Raises SourceError.
     """
     if not os.path.isdir(path) and _is_kitti(path):
         found = [_pose(line, f"{path}:{n}") for n, line in enumerate(_frame_lines(path, len(stamps_ns)), 1)]
@@ -98,7 +98,7 @@ def _is_kitti(path: Path) -> bool:
     try:
         lines = read_text(path, MAX_LIST, "replace").split("\n", 1)
     except OSError:
-        return True  # which says what is wrong
+        return True  # the reader reports the error
     return len(lines[0].split()) in (0, 12)
 
 
@@ -116,7 +116,7 @@ def read_oxts_file(path: Path, frames: int, T_cam0_imu: Transform) -> FramePoses
 
 
 def read_oxts_files(paths: Sequence[Path], T_cam0_imu: Transform) -> FramePoses:
-    """Return the poses in files with one oxts packet each (KITTI raw); one that is missing spoils its own frame."""
+    """Return the poses in files with one oxts packet each (KITTI raw); a missing one affects only its own frame."""
     packets = [_packet_file(path) for path in paths]
     return FramePoses(camera_poses(packets, T_cam0_imu), str(paths[0].parent) if paths else "oxts")
 
@@ -124,7 +124,7 @@ def read_oxts_files(paths: Sequence[Path], T_cam0_imu: Transform) -> FramePoses:
 def read_oxts_motions(paths: Sequence[Path]) -> NDArray[np.float64]:
     """Return wx wy wz in rad/s and ax ay az in m/s^2, (N, 6), of files with one oxts packet each.
 
-    Along the vehicle's axes, x forward, y left, z up. NaN where a file is missing or has less.
+    Along the vehicle's axes, x forward, y left, z up. NaN if a file is missing or too short.
     """
     packets = [_packet_file(path) for path in paths]
     found = np.full((len(packets), 6), np.nan)
@@ -137,9 +137,9 @@ def read_oxts_motions(paths: Sequence[Path]) -> NDArray[np.float64]:
 def camera_poses(packets: Sequence[NDArray[np.float64] | str], T_cam0_imu: Transform) -> list[Transform | str]:
     """Return T_world_cam0 for each packet (latitude, longitude in degrees, altitude, roll, pitch, yaw in radians).
 
-    World: east, north, up, by the Mercator projection of KITTI's development kit (`convertOxtsToPose`), its scale that
-    of the first packet's latitude. T_cam0_imu: (4, 4), calib_velo_to_cam times calib_imu_to_velo, rectified. A packet
-    that is a text (what is wrong with it) stays one.
+    World: east, north, up, by the Mercator projection of KITTI's development kit (`convertOxtsToPose`), scaled for
+    the first packet's latitude. T_cam0_imu: (4, 4), calib_velo_to_cam times calib_imu_to_velo, rectified. A packet
+    that is a string (its fault) is kept.
     """
     first = next((packet for packet in packets if not isinstance(packet, str)), None)
     if first is None:
@@ -176,7 +176,7 @@ def _pose(line: str, where: str) -> Transform | str:
         return f"{where}: holds {len(numbers)} numbers; write the 12 of a 3x4 matrix"
     T[:3] = numbers.reshape(3, 4)
     if rigidity_error(T) > ROUNDING:
-        return f"{where}: is no rigid motion; correct the line or leave its frame out"
+        return f"{where}: is not a rigid motion; correct the line or leave its frame out"
     return orthonormalise(T)
 
 
@@ -195,7 +195,7 @@ def _packet(line: str, where: str) -> NDArray[np.float64] | str:
 
 
 def _floats(line: str) -> NDArray[np.float64]:
-    """Return the numbers of a line; none if one of its words is no number."""
+    """Return the numbers of a line, an empty array if a word is not a number."""
     try:
         return np.array([float(word) for word in line.split()])
     except ValueError:
@@ -210,5 +210,5 @@ def _frame_lines(path: Path, frames: int) -> list[str]:
     while lines and not lines[-1].strip():
         lines.pop()
     if len(lines) > frames:
-        raise SourceError(f"{path}: {len(lines)} poses for {frames} frames; name the file of this very recording")
+        raise SourceError(f"{path}: {len(lines)} poses for {frames} frames; name the file of this recording")
     return lines

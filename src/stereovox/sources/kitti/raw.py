@@ -35,15 +35,15 @@ class KittiRaw(KittiSource):
     """A drive folder `2011_09_26_drive_0001_sync`, with the three `calib_*.txt` in the date folder above it.
 
     where: the folder, or with options `DRIVE?camera=colour&poses=oxts`:
-        camera: `grey` (image_00 and 01) or `colour` (02 and 03); without it grey where there are such images.
-        poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
-            packets), or a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it the first of these there
-            is. axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to
-            camera. imu: `off` to leave the inertial unit out.
-    posed: without it poses are not looked for, and are NaN.
-    IMU: angular rates and accelerations of oxts, at oxts/timestamps.txt, as often as there are images.
-    Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
-    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
+            camera: `grey` (image_00 and 01) or `colour` (02 and 03); default: grey if there are such images.
+            poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
+                packets), or a file of T_world_cam0 of any form (see `rgbd.pose_files`); default: the first that
+                exists. axes: of the posed camera, `optical` (default), `opengl` or `ros`. invert: 1 for world to
+                camera. imu: `off` to leave the inertial unit out.
+        posed: if False, poses are not searched for, and are NaN.
+        IMU: angular rates and accelerations of oxts, at oxts/timestamps.txt, as often as there are images.
+        Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
+        World and faults: see `KittiSource`. Raises SourceError if a whole part is missing.
     """
 
     layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt next to the drive)"
@@ -68,7 +68,7 @@ class KittiRaw(KittiSource):
 
     @classmethod
     def depth_only(cls, where: str) -> KittiRaw:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return cls(where, posed=False)
 
     @classmethod
@@ -92,7 +92,7 @@ class KittiRaw(KittiSource):
         return self.folder / "velodyne_points" / "data" / f"{i:010d}.bin"
 
     def imu(self) -> ImuReadings | None:
-        """Return angular rates and accelerations of oxts; None if missing, or nothing says how it is mounted.
+        """Return angular rates and accelerations of oxts; None if they or their mount are missing.
 
         Raises SourceError if they are damaged.
         """
@@ -155,5 +155,5 @@ def _stamp(text: str, where: str) -> int:
     except ValueError:
         stamp = np.datetime64("NaT", "ns")
     if np.isnat(stamp):
-        raise SourceError(f"{where}: '{text}' is no time like 2011-09-26 14:05:35.913420800; correct the line")
+        raise SourceError(f"{where}: '{text}' is not a time like 2011-09-26 14:05:35.913420800; correct the line")
     return int(stamp.astype(np.int64))

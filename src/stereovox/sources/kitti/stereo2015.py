@@ -22,15 +22,15 @@ from stereovox.sources.rigs.rig_options import folder_and_options
 
 SCENE = re.compile(r"(\d{6})_10\.png")
 LEFT, RIGHT, MOVING = "image_2", "image_3", "obj_map"
-SINGLE = "single scenes without poses: each is at the origin of a world of its own; map one, for example --frames 0:1"
+SINGLE = "single scenes without poses: each is at the origin of its own world; map one, for example --frames 0:1"
 
 
 class KittiStereo2015(KittiSource):
-    """A folder `training` with image_2/000000_10.png and image_3; of each scene only this first pair is used.
+    """A folder `training` with image_2/000000_10.png and image_3; only this first pair of each scene is used.
 
     Calibration: `calib/000000.txt` (object data style), or calib_cam_to_cam/000000.txt with calib_velo_to_cam and
-    calib_imu_to_velo next to it; scenes may differ, in image size too, so `camera` is only that of the first one.
-    Scans: `velodyne/000000.bin`, which the benchmark does not have but some collections add. Moving objects: obj_map.
+    calib_imu_to_velo next to it; scenes may differ, also in image size, so `camera` is the first one's.
+    Scans: `velodyne/000000.bin`, which only some collections add to the benchmark. Moving objects: obj_map.
     World: camera 0 of each scene, upright; there are no poses. Time: one second for each scene number.
     Faults: see `KittiSource`. Raises SourceError if a calibration is missing or bad.
     """
@@ -98,7 +98,7 @@ class KittiStereo2015(KittiSource):
     def _camera(self, i: int, usual: tuple[int, int]) -> PinholeCamera:
         try:
             size = png_size(self.images(i)[0], PICTURE_KINDS)
-        except FrameRefused:  # said when the frame is read
+        except FrameRefused:  # reported when the frame is read
             size = usual
         return self._calibrations[i].camera(*self.eyes, size)
 

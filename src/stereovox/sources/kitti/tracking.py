@@ -26,7 +26,7 @@ from stereovox.sources.rigs.rig_options import POSES, folder_and_options
 FIELDS = 17
 """frame, track, kind, truncated, occluded, alpha, 4 of the 2-D box, h, w, l, x, y, z, rotation_y; perhaps a score."""
 NO_BOX = "DontCare"
-"""Marks a region of the image in which nothing is annotated; it has no 3-D box."""
+"""Marks an image region without annotations; it has no 3-D box."""
 Label = tuple[int, str, tuple[float, ...]]
 IMAGE = re.compile(r"(\d{6})\.png")
 SEQUENCE = re.compile(r"(\d{4})")
@@ -38,11 +38,11 @@ class KittiTracking(KittiSource):
     """One sequence: `training/image_02/0000/000000.png`, image_03, velodyne, oxts, calib, label_02.
 
     where: `training/image_02/0000`, or `training?sequence=0000`; further options:
-        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`) instead of `oxts/0000.txt`. axes: of the
-            camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
-        fps: frames a second.
-    Time: the files hold none; frame number / 10 Hz, or `fps`. Colour images; label boxes are in rectified camera 0.
-    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole and bad labels.
+            poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`) instead of `oxts/0000.txt`. axes: of the
+                posed camera, `optical` (default), `opengl` or `ros`. invert: 1 for world to camera.
+            fps: frames a second.
+        Time: the files have none; frame number / 10 Hz, or `fps`. Colour images; label boxes are in rectified camera 0.
+        World and faults: see `KittiSource`. Raises SourceError if a whole part is missing, and for bad labels.
     """
 
     layout = "a KITTI tracking sequence (training?sequence=0000 with image_02/0000 and calib/0000.txt)"
@@ -63,7 +63,7 @@ class KittiTracking(KittiSource):
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
-        folder = Path(os.path.abspath(folder_part(where)))  # unlike resolve() it takes any text
+        folder = Path(os.path.abspath(folder_part(where)))  # unlike resolve(), it accepts any text
         if folder.parent.name == LEFT:
             return os.path.isdir(folder) and os.path.isdir(folder.parents[1] / "calib")
         return os.path.isdir(folder / LEFT) and os.path.isdir(folder / "calib")
@@ -106,7 +106,7 @@ class KittiTracking(KittiSource):
         path = self._file("label_02")
         if os.path.isfile(path):
             return read_labels(path)
-        self.notes = (f"{path}: no such file, so no object is annotated; moving ones stay in the truth",)
+        self.notes = (f"{path}: no such file, so objects are not annotated; moving ones stay in the truth",)
         return Labels({})
 
 
@@ -127,7 +127,7 @@ class Labels:
 def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotation_y: float) -> Transform:  # noqa: E741
     """Return T_cam0_box (4, 4): from the frame of `Box` into rectified camera 0.
 
-    KITTI's position is the middle of the box's bottom, y points down, and rotation_y turns about y: at 0 the object
+    KITTI's position is the centre of the box's bottom, y points down, and rotation_y turns about y: at 0 the object
     faces along camera x, at -90 degrees along the optical axis.
     """
     c, s = math.cos(rotation_y), math.sin(rotation_y)
@@ -135,7 +135,7 @@ def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotatio
 
 
 def read_labels(path: Path) -> Labels:
-    """Return the annotated objects; raises SourceError naming file and line for what cannot be read."""
+    """Return the annotated objects; raises SourceError with file and line if one cannot be read."""
     try:
         lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
@@ -163,16 +163,16 @@ def _label(words: list[str], where: str) -> tuple[int, Label]:
 
 
 def _sequence(folder: Path, choice: str) -> tuple[Path, str]:
-    """Return the folder that holds all sequences, and the number of the one that is meant."""
+    """Return the folder of all sequences, and the number of the selected one."""
     whole = Path(os.path.abspath(folder))
     if whole.parent.name == LEFT:
         if choice:
-            raise SourceError(f"{folder}: is a sequence already; leave sequence={choice} out")
+            raise SourceError(f"{folder}: is already a sequence; leave sequence={choice} out")
         return whole.parents[1], whole.name
     known = numbers_in(folder / LEFT, SEQUENCE)
     if not choice and len(known) == 1:
         return folder, known[0]
     if choice not in known:
         found = f"holds sequences {', '.join(known)}" if known else f"has no sequence in {LEFT}"
-        raise SourceError(f"{folder}: {found}; say which: {folder}?sequence={known[0] if known else '0000'}")
+        raise SourceError(f"{folder}: {found}; choose one: {folder}?sequence={known[0] if known else '0000'}")
     return folder, choice

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a sensor's clock still agrees with that of the poses, by when stamps arrive.
+"""Checks whether a sensor's clock still agrees with the clock of the poses, by the arrival of stamps.
 
-Whatever a stamp is by, it arrives later than it was taken. The least of these delays within a second hardly changes,
-unless a clock was set, one of the clocks drifts, or messages come later than before. So the delay of each image is
-compared with that of the poses, and with what it was at the start. The clock of this machine does not matter: arrivals
-are counted by one that never steps, and what sets both other clocks changes both delays.
+Every stamp arrives some time after it was taken. The smallest of these delays within a second hardly changes,
+unless a clock was set, a clock drifts, or messages arrive later than before. So the delay of each image is
+compared with the delay of the poses, and with its value at the start. This machine's clock does not matter: arrivals
+are timed by one that never steps, and setting both other clocks changes both delays.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from threading import Lock
 from typing import NamedTuple
 
 WINDOW_NS = 1_000_000_000
-"""Time over which the least delay counts."""
+"""Time over which the smallest delay counts."""
 USUAL_NS, ANNOUNCED_NS = 80_000_000, 20_000_000
-"""By how much the delay of an image may differ from the usual; and once a stamp went back, which is how a clock that
-is set back announces itself."""
+"""Tolerated change of the delay of an image; and the one after a stamp went back, which indicates that a clock was
+set back."""
 START_NS = 300_000_000
-"""By how much images and poses may come apart at the start: a camera takes some time to deliver, and so does what finds
-poses."""
+"""Tolerated difference of the delays of images and poses at the start: both the camera and the source of poses take
+some
+time to deliver."""
 SETTLE_NS = 1_000_000_000
-"""Time from the first image on in which the usual delay is found."""
+"""Time from the first image during which the usual delay is measured."""
 OPEN, GONE, LATE, CLOCK = "", "gone", "late", "clock"
-"""What became of a doubt: still open; delays are as usual again; images come later, and their stamps are right; the
+"""Outcomes of a doubt: still open; delays are normal again; images arrive later, with correct stamps; the
 clock was set."""
 
 
 class Delays:
-    """The least delay from stamp to arrival within the last second. Threads may share it.
+    """The smallest delay from stamp to arrival within the last second. Thread-safe.
 
     Attributes:
         set_back: How often the stamps went back.
@@ -41,7 +42,7 @@ class Delays:
         self._least: deque[tuple[int, int]] = deque()  # arrival and delay; delays ascend
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> None:
-        """Take in a stamp. arrived_ns: monotonic. A clock that goes back begins anew."""
+        """Record a stamp. arrived_ns: monotonic. A clock that goes back starts anew."""
         delay_ns = arrived_ns - stamp_ns
         with self._lock:
             if stamp_ns < self._newest_ns - ANNOUNCED_NS:
@@ -53,14 +54,14 @@ class Delays:
             self._least.append((arrived_ns, delay_ns))
 
     def least_ns(self, now_ns: int) -> int | None:
-        """Return the least delay of the last second; None if nothing came within it."""
+        """Return the smallest delay of the last second; None if nothing arrived within it."""
         with self._lock:
             while self._least and now_ns - self._least[0][0] > WINDOW_NS:
                 self._least.popleft()
             return self._least[0][1] if self._least else None
 
     def forget(self) -> None:
-        """Forget what was heard so far."""
+        """Forget all recorded stamps."""
         with self._lock:
             self._least.clear()
             self._newest_ns = 0
@@ -68,12 +69,12 @@ class Delays:
 
 @dataclass(eq=False)
 class ClockDoubt:
-    """Images that come earlier or later than their stamps and those of the poses allow.
+    """Images that arrive earlier or later than their stamps and those of the poses allow.
 
     Attributes:
-        off_ns: By how much later they come; the clock was set back by this much, unless they are late.
+        off_ns: How much later they arrive; the clock was set back by this much, unless they are late.
         since_ns: When the first one arrived.
-        start: Whether it was so from the first image on.
+        start: Whether this was so from the first image on.
         announced: Whether a stamp went back.
         became: OPEN, GONE, LATE or CLOCK.
         told: Whether the user was informed.
@@ -88,15 +89,16 @@ class ClockDoubt:
 
     @property
     def cleared(self) -> bool:
-        """Whether the stamps of its images have turned out to be right."""
+        """Whether the stamps of its images have proved right."""
         return self.became == LATE or (self.became == GONE and not self.announced)
 
 
 class Heard(NamedTuple):
-    """What was known of the stamp of a message when it arrived.
+    """State of a message's stamp at its arrival.
 
-    doubt: what it is in; None: nothing. set_back: how often the clock of the poses had been. judged: whether anything
-    could be said; else it shares a doubt that comes up later.
+    doubt: the doubt it belongs to; None: none. set_back: how often the poses' clock had been set back. judged: whether
+    it
+    could be judged; else it shares a later doubt.
     """
 
     doubt: ClockDoubt | None = None
@@ -113,11 +115,11 @@ class Heard(NamedTuple):
 class ClockWatch:
     """Compares the stamps of a sensor with those of the poses, as both arrive.
 
-    poses: delays of the poses, which whoever receives them takes in. start_ns: as START_NS.
-    Any thread may ask; one calls `heard`.
+    poses: delays of the poses, filled by their receiver. start_ns: as START_NS.
+    Any thread may read; one calls `heard`.
 
     Attributes:
-        doubt: The doubt that is open; None: the clocks agree, or no poses come to compare with.
+        doubt: The open doubt; None: the clocks agree, or there are no poses to compare with.
     """
 
     def __init__(self, poses: Delays, start_ns: int = START_NS):
@@ -128,10 +130,10 @@ class ClockWatch:
         self.doubt: ClockDoubt | None = None
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> ClockDoubt | None:
-        """Take in the stamp of an image; return the doubt that it belongs to.
+        """Record the stamp of an image; return the doubt that it belongs to.
 
         Args:
-            stamp_ns: By the clock of the poses, as far as is known.
+            stamp_ns: By the clock of the poses, as far as known.
             arrived_ns: Monotonic.
         """
         backwards = self._newest_ns is not None and stamp_ns < self._newest_ns
@@ -143,7 +145,7 @@ class ClockWatch:
         late_ns = arrived_ns - stamp_ns - poses_ns
         announced = backwards or (self.doubt is not None and self.doubt.announced)
         least_ns = self._delays.least_ns(arrived_ns)
-        assert least_ns is not None  # that of this image
+        assert least_ns is not None  # at least this image's own
         early = self.doubt is not None and self.doubt.off_ns < 0  # then the least counts: any image may come late
         if self._is_usual(least_ns - poses_ns if early else late_ns, announced):
             self._end(GONE)
@@ -161,18 +163,18 @@ class ClockWatch:
         return self.doubt
 
     def announce(self, back_ns: int, arrived_ns: int) -> None:
-        """Say that a stamp went back while nothing could be said of arrivals."""
+        """Report that a stamp went back while arrivals could not be judged."""
         if self.doubt is None:
             self.doubt = ClockDoubt(back_ns, arrived_ns, announced=True)
 
     def late(self) -> None:
-        """Say that the stamps are right: images come as much later, or earlier, as they do now."""
+        """Report that the stamps are right: images arrive with the current delay from now on."""
         if self.doubt is not None:
             self._usual_ns = (self._usual_ns or 0) + self.doubt.off_ns
         self._end(LATE)
 
     def corrected(self) -> None:
-        """Say that the clock was set, and that the stamps from now on are corrected for it."""
+        """Report that the clock was set, and that the stamps from now on are corrected for it."""
         self._newest_ns = None
         self._delays.forget()
         self._end(CLOCK)

@@ -19,22 +19,23 @@ from stereovox.sources.poses.clock_watch import Delays
 from stereovox.sources.poses.poses import Poses, seconds_from_ns
 
 KEPT = 4000
-"""Poses that are kept: 20 s at 200 Hz. The older half is dropped when there are more."""
+"""Poses that are kept: 20 s at 200 Hz. The older half is dropped if there are more."""
 RESET_NS = 1_000_000_000
-"""A pose this much older than the newest one means that the clock was set back: all before it are dropped."""
+"""A pose this much older than the newest one means that the clock was set back: all earlier ones are dropped."""
 SET_BACK, REORDERED_NS = 3, 50_000_000
-"""So many poses in a row that ascend as time passes, all older than the newest one, mean the same. One that is
-older by more than messages overtake each other waits for the next ones, for it may be by another clock."""
+"""This many consecutive poses, ascending as time passes but all older than the newest one, mean the same. A pose that
+is
+older by more than messages overtake each other waits for the next ones, since it may use another clock."""
 RIGID = 1e-3
-"""Largest rigidity error of a pose that can be used."""
+"""Largest rigidity error of a usable pose."""
 MAX_SPEED_MPS, MAX_TURN_DPS = 10.0, 720.0
 """Speeds beyond which two neighbouring poses are a jump; as in `pair.toml`."""
 CLOCKS_APART_NS = 10_000_000_000
-"""Images and poses that are further apart than this have different clocks."""
+"""Images and poses further apart than this use different clocks."""
 
 
 class _Late(NamedTuple):
-    """A pose that is not newer than one before it, and when it came."""
+    """A pose not newer than an earlier one, and its arrival."""
 
     stamp_ns: int
     T: Transform
@@ -42,23 +43,23 @@ class _Late(NamedTuple):
 
 
 class LivePoses:
-    """A buffer of poses of a body in a world, in order of time. Any thread may add some while others ask.
+    """A buffer of poses of a body in a world, in order of time. Thread-safe.
 
-    A pose between two others is interpolated between them as `Poses.at` does: straight in position, with a constant
+    A pose between two others is interpolated as in `Poses.at`: linear in position, with a constant
     turn rate in rotation. It is never extrapolated, and not interpolated across a gap (a neighbour 0.1 s or more away),
-    a jump, or a pose that cannot be used.
+    a jump, or an unusable pose.
 
     Args:
-        where: What they come from, for messages.
+        where: Origin of the poses, for messages.
         max_speed_mps: Poses further apart than this speed allows are a jump, in metres a second.
         max_turn_dps: The same in degrees a second.
         clock: Monotonic seconds, for waiting.
 
     Attributes:
         added: Number of poses that were added.
-        counts: What else became of them: `unusable`, `late` (older than one before), `repeated`, `clock_reset`,
+        counts: How many were `unusable`, `late` (older than an earlier one), `repeated`, `clock_reset`,
             `jumps`.
-        delays: How long poses take to come, by `clock`.
+        delays: Delays of the poses, by `clock`.
     """
 
     def __init__(
@@ -81,14 +82,13 @@ class LivePoses:
         self.delays = Delays()
 
     def add(self, stamp_ns: int, T_world_body: ArrayLike, confident: bool = True) -> None:
-        """Take in a pose; the first of several with one stamp counts.
+        """Add a pose; the first of several with one stamp counts.
 
         Args:
             stamp_ns: Its time in int64 nanoseconds.
-            T_world_body: (4, 4), maps the body (x forward, y left, z up) into the world (z up). One that is not
-                finite or no rigid motion is remembered as unusable, and whatever needs it is refused: say so with NaN
-                where a tracker is lost.
-            confident: Whether its tracker trusts it; a pose that it does not trust is unusable, too.
+            T_world_body: (4, 4), maps the body (x forward, y left, z up) into the world (z up). A non-finite or
+                non-rigid one is stored as unusable, and frames that need it are refused: pass NaN if a tracker is lost.
+            confident: Whether its tracker trusts it; if not, the pose is unusable, too.
         """
         stamp_ns, T = int(stamp_ns), np.array(T_world_body, float)
         if not confident:
@@ -107,19 +107,19 @@ class LivePoses:
             tell()
 
     def at(self, stamp_ns: int, wait_s: float = 0.0) -> Transform:
-        """Return T_world_body (4, 4) at a time, once both its neighbours are there.
+        """Return T_world_body (4, 4) at a time, once both its neighbours have arrived.
 
         Args:
             stamp_ns: The time in nanoseconds, by the clock of the poses.
             wait_s: Longest wait for a pose that is not earlier, in seconds.
 
         Returns:
-            The pose of that very time, else the one between its neighbours.
+            The pose at exactly that time, else interpolated between its neighbours.
 
         Raises:
-            FrameRefused: `no_pose` if a neighbour did not come in time or is 0.1 s or more away, `pose_jump` if
+            FrameRefused: `no_pose` if a neighbour did not arrive in time or is 0.1 s or more away, `pose_jump` if
                 the body jumped between them, `low_confidence` if its tracker does not trust a neighbour,
-                `bad_pose_file` if a neighbour cannot be used for another reason.
+                `bad_pose_file` if a neighbour is unusable for another reason.
         """
         stamp_ns = int(stamp_ns)
         with self._change:
@@ -131,7 +131,7 @@ class LivePoses:
             poses = [self._poses[stamp] for stamp in near]
             unsure = [stamp for stamp in near if stamp in self._unsure]
         if not near:
-            raise FrameRefused("no_pose", f"{self.where}: {ended or 'no pose has come yet'}")
+            raise FrameRefused("no_pose", f"{self.where}: {ended or 'no pose has arrived yet'}")
         if near[0] - stamp_ns > CLOCKS_APART_NS or stamp_ns - near[-1] > CLOCKS_APART_NS:
             raise FrameRefused("no_pose", self._apart(stamp_ns, near))
         try:
@@ -149,7 +149,7 @@ class LivePoses:
         return found
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, with one more at either end; None if there are fewer than two."""
+        """Return the poses of a time span, with one more at either end; None if there are fewer than two."""
         with self._change:
             begin = max(bisect_left(self._stamps, first_ns) - 1, 0)
             stamps = self._stamps[begin : bisect_left(self._stamps, last_ns) + 1]
@@ -157,12 +157,12 @@ class LivePoses:
         return Poses(stamps, poses, where=self.where) if len(stamps) > 1 else None
 
     def is_final(self, stamp_ns: int) -> bool:
-        """Return whether it is decided what `at` says: a pose that is not earlier came, or none will come any more."""
+        """Return whether the result of `at` is final: a pose that is not earlier arrived, or no more will arrive."""
         with self._change:
             return self._is_final(int(stamp_ns))
 
     def end(self, why: str) -> None:
-        """Say that no more poses will come, and why in a few words; nobody waits for them any longer."""
+        """Report that no more poses will arrive, and why in a few words; all waiting threads continue."""
         with self._change:
             self._ended = why
             self._change.notify_all()
@@ -170,7 +170,7 @@ class LivePoses:
             tell()
 
     def resume(self) -> None:
-        """Say that poses come again."""
+        """Report that poses arrive again."""
         with self._change:
             self._ended = ""
 
@@ -186,7 +186,7 @@ class LivePoses:
 
     @property
     def newest(self) -> tuple[int, Transform] | None:
-        """Stamp and T_world_body (4, 4) of the newest pose, NaN if it cannot be used; None without any."""
+        """Stamp and T_world_body (4, 4) of the newest pose, NaN if it is unusable; None without any."""
         with self._change:
             return (self._stamps[-1], self._poses[self._stamps[-1]]) if self._stamps else None
 
@@ -194,7 +194,7 @@ class LivePoses:
         return len(self._stamps)
 
     def _take(self, stamp_ns: int, T: Transform, now_ns: int) -> None:
-        """Take in a pose; drop those of another clock where it was set back."""
+        """Add a pose; drop those of another clock if it was set back."""
         newest = self._stamps[-1] if self._stamps else stamp_ns
         if stamp_ns < newest - RESET_NS:
             self._reset(-1)
@@ -211,14 +211,14 @@ class LivePoses:
         self._insert(stamp_ns, T)
 
     def _decide(self) -> None:
-        """Put late poses in their places: of those before, if they come all at once; else they are by a new clock."""
+        """Insert late poses: among the earlier ones if they arrive all at once; else they use a new clock."""
         first, last = self._late[0], self._late[-1]
         if 2 * (last.arrived_ns - first.arrived_ns) > last.stamp_ns - first.stamp_ns:
             self._reset(first.stamp_ns)
         self._insert_late()
 
     def _reset(self, before_ns: int) -> None:
-        """Drop all poses that are not before a time: the clock was set back. -1: all."""
+        """Drop all poses from a time on, because the clock was set back. -1: all."""
         self.counts["clock_reset"] += 1
         left = 0 if before_ns < 0 else bisect_left(self._stamps, before_ns)
         for stamp in self._stamps[left:]:
@@ -255,14 +255,14 @@ class LivePoses:
         return bool(self._ended) or bool(self._stamps and self._stamps[-1] >= stamp_ns)
 
     def _near(self, stamp_ns: int) -> list[int]:
-        """Return the stamp of the pose at that time, else those before and after it, as far as there are some."""
+        """Return the stamp of the pose at that time, else those before and after it, as far as available."""
         if stamp_ns in self._poses:
             return [stamp_ns]
         after = bisect_left(self._stamps, stamp_ns)
         return self._stamps[max(after - 1, 0) : after + 1]
 
     def _is_jump(self, stamps: Sequence[int], poses: Sequence[Transform]) -> bool:
-        """Return whether the body moved or turned too fast from one pose to the next; not where one is unusable."""
+        """Return whether the body moved or turned too fast from one pose to the next; False if one is unusable."""
         before, after = poses
         if not (np.isfinite(before).all() and np.isfinite(after).all()):
             return False

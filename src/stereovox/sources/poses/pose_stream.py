@@ -23,27 +23,27 @@ from stereovox.sources.realsense.realsense import library
 from stereovox.sources.realsense.realsense_sensor import ns_from_ms
 
 HERE = "127.0.0.1"
-"""Where a stream listens unless told otherwise: nobody else on the network can say where the robot is."""
+"""Default address of a stream: nobody else on the network can send the robot's pose."""
 MAX_LINE, MAX_DATAGRAM = 512, 65_536
 """Most bytes of a line and of a datagram."""
 LISTEN_S, RETRY_S = 0.2, 1.0
-"""Seconds until a silent stream looks whether it is to stop, and between two tries to connect."""
+"""Seconds until a silent stream checks whether it must stop, and between two attempts to connect."""
 CONFIDENT = 2.0
-"""Least confidence of a pose, where lines tell one, and of a T265's (0 failed to 3 high)."""
+"""Smallest confidence of a pose, if lines have one, and of a T265's (0 failed to 3 high)."""
 T_OPTICAL_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Maps a body's axes x forward, y left, z up into optical ones."""
 
 
 class PoseStream:
-    """Poses that a thread of its own receives and puts into `poses`, from `start` until `stop`.
+    """Poses that its own thread receives and puts into `poses`, from `start` until `stop`.
 
-    A registered class also has `recognises(where: str) -> bool` and is made from `where` alone.
+    A registered class also has `recognises(where: str) -> bool` and is constructed from `where` alone.
 
     Attributes:
         name: For messages.
-        poses: What they are put into.
-        counts: What was received: `bad` lines, `low_confidence`, `connections`.
-        trouble: What is wrong with the newest bad line, and with the connection; "" if nothing is.
+        poses: The buffer that is filled.
+        counts: Events: `bad` lines, `low_confidence`, `connections`.
+        trouble: The fault of the newest bad line, or of the connection; "" if there is none.
     """
 
     def __init__(self, name: str):
@@ -54,7 +54,7 @@ class PoseStream:
         self._thread = Thread(target=self._run, name="stereovox-poses", daemon=True)
 
     def start(self) -> None:
-        """Begin to receive.
+        """Start receiving.
 
         Raises:
             SourceError: The address or device cannot be used.
@@ -62,7 +62,7 @@ class PoseStream:
         self._thread.start()
 
     def stop(self) -> None:
-        """Receive no more."""
+        """Stop receiving."""
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
@@ -86,7 +86,7 @@ class PoseStream:
 
 
 class Received(NamedTuple):
-    """Options behind an address. axes: those of body and world in the lines, a word of `AXES`."""
+    """Options behind an address. axes: axes of body and world in the lines, a word of `AXES`."""
 
     axes: str = "ros"
 
@@ -94,11 +94,11 @@ class Received(NamedTuple):
 class LineStream(PoseStream):
     """Lines `stamp tx ty tz qx qy qz qw [confidence]` (TUM): seconds, metres, quaternion; # begins a comment.
 
-    where: `udp://HOST:PORT` listens there (without HOST: on this machine alone), and `tcp://HOST:PORT` connects to a
-        server that sends lines, and again where it hangs up. `?axes=` behind it: axes of body and world, as in
+    where: `udp://HOST:PORT` listens there (without HOST: only on this machine), and `tcp://HOST:PORT` connects to a
+        server that sends lines, and reconnects if it hangs up. `?axes=` behind it: axes of body and world, as in
         `sources/poses/tracker.py`: `ros` (x forward, y left, z up; default), `ned`, `opengl` or `optical`.
 
-    A line that cannot be read is counted and changes nothing. Below medium confidence (2) a pose cannot be used.
+    An unreadable line is counted and changes nothing. A pose below medium confidence (2) is unusable.
     """
 
     scheme = ""
@@ -110,7 +110,7 @@ class LineStream(PoseStream):
             self.axes = Received(**parameters.typed(given, {"axes": "ros"})).axes
             host, _, port = name.removeprefix(self.scheme).rpartition(":")
             self.address = host.strip("[]") or HERE, int(port)
-            self.address[0].encode("idna")  # as the socket does; raises for what cannot be a host
+            self.address[0].encode("idna")  # as the socket does; raises for an impossible host
             if not 0 <= self.address[1] < 65536:
                 raise ValueError
         except ValueError as error:
@@ -126,7 +126,7 @@ class LineStream(PoseStream):
         return where.startswith(cls.scheme)
 
     def take(self, line: bytes) -> None:
-        """Take in one line."""
+        """Process one line."""
         text = line.partition(b"#")[0].strip()
         if not text:
             return
@@ -150,7 +150,7 @@ class UdpPoses(LineStream):
     scheme = "udp://"
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         self._socket = _opened(self.name, self.address, socket.SOCK_DGRAM)
         self._socket.settimeout(LISTEN_S)
         self.port: int = self._socket.getsockname()[1]
@@ -170,7 +170,7 @@ class UdpPoses(LineStream):
 
 
 class TcpPoses(LineStream):
-    """Lines that a server sends; see `LineStream`."""
+    """Lines sent by a server; see `LineStream`."""
 
     scheme = "tcp://"
 
@@ -186,17 +186,17 @@ class TcpPoses(LineStream):
                 why = "the server hung up"
             except OSError as error:
                 why = error.strerror or str(error)
-            self.trouble = f"{self.name}: {why}; it is tried again"
+            self.trouble = f"{self.name}: {why}; trying again"
             self.poses.end(why)
             self._stopped.wait(RETRY_S)
 
 
 class T265(PoseStream):
-    """A connected tracking camera, `t265` or `t265:SERIAL`, whose body is the tracker, looking ahead.
+    """A connected tracking camera, `t265` or `t265:SERIAL`, whose body is the tracker, facing forward.
 
-    Poses below medium confidence cannot be used. context: as for `RealSense`.
+    Poses below medium confidence are unusable. context: as for `RealSense`.
     Raises MissingExtra without pyrealsense2; SourceError if none is connected, as with pyrealsense2 2.55 and later,
-    which no longer know it.
+    which no longer support it.
     """
 
     def __init__(self, where: str, context: Any = None):
@@ -217,7 +217,7 @@ class T265(PoseStream):
             raise SourceError(f"{where}: {error}; plug it in again") from None
         if not found:
             cure = "it needs pyrealsense2 before 2.55; or send its poses as lines (udp://:5005)"
-            raise SourceError(f"{where}: no tracking camera is connected that pyrealsense2 knows; {cure}")
+            raise SourceError(f"{where}: pyrealsense2 finds no tracking camera; {cure}")
         self._sensor, self._profile = found[0]
 
     @classmethod
@@ -226,7 +226,7 @@ class T265(PoseStream):
         return where.partition(":")[0] == "t265"
 
     def start(self) -> None:
-        """Begin to track."""
+        """Start tracking."""
         try:
             self._sensor.open(self._profile)
             self._sensor.start(self._queue)
@@ -245,7 +245,7 @@ class T265(PoseStream):
                 try:
                     end()
                 except RuntimeError:
-                    continue  # pulled out
+                    continue  # unplugged
 
     def _take(self, image: Any) -> None:
         data = image.as_pose_frame().get_pose_data()
@@ -288,7 +288,7 @@ def body_pose(T_file: Transform, axes: str) -> NDArray[np.float64]:
 
 
 def lines_of(receive: Callable[[int], bytes], stopped: Callable[[], bool]) -> Iterator[bytes]:
-    """Yield the lines of a stream of bytes until it ends; what is longer than a line may be comes cut."""
+    """Yield the lines of a stream of bytes until it ends; overlong lines are truncated."""
     rest = b""
     while not stopped():
         try:

@@ -18,16 +18,16 @@ MAX_GAP_NS = 100_000_000
 
 
 class Poses:
-    """Poses of a body (a camera, a tracker) in a world, each with a time; in order of time, no time twice.
+    """Poses of a body (a camera, a tracker) in a world, each with a unique time; in order of time.
 
     stamps_ns: (N,) int64 nanoseconds, in any order; of several with one stamp the first counts.
-    T_world_body: (N, 4, 4) float64, in the same order. NaN marks a pose that cannot be used: it is remembered, and
-        whatever needs it is refused.
-    confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None if it is not known.
-    where: what the poses came from, for messages: a file or topic.
-    faults: why poses cannot be used, by stamp; one line each with the cure.
-    repeated: how many poses were left out, since another one with their stamp came before.
-    Raises SourceError if there is no pose at all or the arrays do not fit together.
+    T_world_body: (N, 4, 4) float64, in the same order. NaN marks an unusable pose: it is kept, and
+        frames that need it are refused.
+    confidence: (N,) float64, larger is better (T265: 0 failed to 3 high), or None if unknown.
+    where: origin of the poses, for messages: a file or topic.
+    faults: why poses are unusable, by stamp; one line each with the cure.
+    repeated: number of poses left out because an earlier one has the same stamp.
+    Raises SourceError if there is no pose or the arrays do not fit together.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class Poses:
         return len(self._stamps)
 
     def at(self, stamp_ns: int) -> Transform:
-        """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between the neighbours before and after.
+        """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between its neighbours.
 
         Straight line in position, constant turn rate in rotation.
         Raises FrameRefused: `no_pose` if one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
-        if a neighbour cannot be used.
+        if a neighbour is unusable.
         """
         before, after = self.neighbours(stamp_ns)
         if before == after:
@@ -70,7 +70,7 @@ class Poses:
         return interpolate(self._pose(before), self._pose(after), (stamp_ns - start) / (end - start))
 
     def neighbours(self, stamp_ns: int) -> tuple[int, int]:
-        """Return the numbers of the poses before and after `stamp_ns`, twice the same where one has that very time.
+        """Return the numbers of the poses before and after `stamp_ns`, twice the same if one has exactly that time.
 
         Raises FrameRefused `no_pose` if one of them is missing or 0.1 s or more away.
         """
@@ -102,10 +102,10 @@ class Poses:
 
 
 class UnknownPoses:
-    """The poses of a recording whose poses were not looked for: all NaN."""
+    """The poses of a recording whose poses were not searched for: all NaN."""
 
     def at(self, i: int) -> Transform:
-        """Return NaN (4, 4), whatever number or time `i` is."""
+        """Return NaN (4, 4), for any number or time `i`."""
         return np.full((4, 4), np.nan)
 
 

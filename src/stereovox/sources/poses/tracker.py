@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses from a tracking camera (RealSense T265 and its kind): other axes, a confidence, jumps, a clock of its own.
+"""Poses from a tracking camera (RealSense T265 and similar): other axes, a confidence, jumps, its own clock.
 
-Axes. The map works in optical axes: x right, y down, z forward. A T265 reports OpenGL axes: x right, y up, z backward
+Axes. The map uses optical axes: x right, y down, z forward. A T265 reports OpenGL axes: x right, y up, z backward
 (Chien 2020, section 4.1 and Fig 4.1). With C = diag(1, -1, -1) for its body and its world alike,
 T_map_body = C T_file C. See docs/conventions.md for the picture.
 """
@@ -24,12 +24,12 @@ AXES = {
     "ros": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
     "ned": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 }
-"""Rotations that turn coordinates in these axes into optical ones.
+"""Rotations from these axes into optical ones.
 
 `ros`: x forward, y left, z up (REP 103); `ned`: x forward, y right, z down (aircraft, AirSim).
 """
 WORLDS = ("up", "optical", "file")
-"""Axes of the map: z up, x forward, y left; optical (Chien 2020); or just those of the file."""
+"""Axes of the map: z up, x forward, y left; optical (Chien 2020); or the file's own."""
 HIGHEST_CONFIDENCE = 3
 
 
@@ -37,8 +37,8 @@ def read_tracker(path: Path, axes: str = "opengl", world: str = "up") -> Poses:
     """Return the poses in a file of lines `stamp tx ty tz qx qy qz qw [confidence]`, in optical axes of the body.
 
     The confidence is 0 (failed), 1 (low), 2 (medium) or 3 (high); either every line has one or none. T_world_body maps
-    the tracker's body, in optical axes, into `world` (see `WORLDS`); `axes`: those of the file. Raises SourceError for
-    unknown axes and a file that cannot be read or holds no pose; a line with a stamp but no usable pose is kept (see
+    the tracker's body, in optical axes, into `world` (see `WORLDS`); axes: the file's. Raises SourceError for
+    unknown axes and if the file is unreadable or has no pose; a line with a stamp but no usable pose is kept (see
     `Poses`).
     """
     _check_word("axes", axes, AXES)
@@ -58,7 +58,7 @@ def read_tracker(path: Path, axes: str = "opengl", world: str = "up") -> Poses:
 
 
 def turned(T_file: NDArray[np.float64], axes: str, world: str) -> NDArray[np.float64]:
-    """Return (N, 4, 4) poses of a body in optical axes in `world`, of poses whose body and world have `axes`.
+    """Return (N, 4, 4) poses of a body in optical axes in `world`, from poses whose body and world have `axes`.
 
     Chien 2020, section 4.1: T_map_body = C T_file C^-1, where C turns `axes` into optical ones.
     """
@@ -83,8 +83,8 @@ def jumps(poses: Poses, max_speed_mps: float, max_turn_dps: float) -> NDArray[np
     """Return the numbers (K, 2) of the poses before and after each jump, between which the tracker moved or turned too
     fast.
 
-    Speeds are over at least 1 ms, so that two stamps that almost coincide make no jump of a tremble. Gaps count by
-    their average speed. Poses that cannot be used are passed over: a jump may lie across them.
+    Speeds are over at least 1 ms, so that jitter between two nearly equal stamps is no jump. Gaps count by
+    their average speed. Unusable poses are skipped: a jump may span them.
     """
     usable = np.flatnonzero(np.isfinite(poses.T_world_body).all(axis=(1, 2)))
     T, stamps_ns = poses.T_world_body[usable], poses.stamps_ns[usable]

@@ -29,8 +29,8 @@ class Trajectory(Poses):
     """Poses in a file of lines `stamp tx ty tz qx qy qz qw`: seconds, metres, quaternion of any length but zero.
 
     Lines may be in any order; of several with one stamp the first counts. A line that has a stamp but no usable pose
-    is remembered, and whatever needs it is refused.
-    Raises SourceError with file and line where a stamp is unreadable, or if there is no line at all.
+    is kept as unusable, and frames that need it are refused.
+    Raises SourceError with file and line if a stamp is unreadable, or if there is no line at all.
     """
 
     def __init__(self, path: Path):
@@ -40,9 +40,9 @@ class Trajectory(Poses):
 
 
 def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[np.float64], whose: str) -> None:
-    """Write poses (N, 4, 4) as lines of the TUM format, all or nothing; `whose`: what is posed, for the first line.
+    """Write poses (N, 4, 4) as lines of the TUM format, all or nothing; whose: the posed body, for the first line.
 
-    Raises MapFileError if the file cannot be written; an older one is then still there.
+    Raises MapFileError if the file cannot be written; an older one is then left intact.
     """
     from scipy.spatial.transform import Rotation
 
@@ -55,7 +55,8 @@ def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[
 
 
 def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
-    """Return the lines of a file of poses in order of time; raises SourceError if there is none or no stamp."""
+    """Return the lines of a file of poses in order of time; raises SourceError if there is none or a stamp is
+    missing."""
     lines = sorted(stamped_lines(path), key=lambda line: line[0])
     if not lines:
         raise SourceError(f"{path}: holds no pose; write lines '{wanted}'")
@@ -63,7 +64,7 @@ def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
 
 
 def pose_numbers(lines: Sequence[StampedLine], count: int, wanted: str) -> tuple[NDArray[np.float64], dict[int, str]]:
-    """Return the (N, count) numbers of the lines, NaN where a line is of no use, and by stamp what is wrong there."""
+    """Return the (N, count) numbers of the lines, NaN for unusable lines, and the faults by stamp."""
     rows, faults = np.full((len(lines), count), np.nan), {}
     for row, (stamp_ns, rest, where) in zip(rows, lines, strict=True):
         try:
@@ -95,26 +96,26 @@ def _numbers(text: str, count: int, wanted: str) -> list[float]:
 
 
 def stamped_lines(path: Path) -> list[StampedLine]:
-    """Return the lines of `path` that start with a time in seconds, in file order, without comments and empty ones.
+    """Return the lines of `path` that start with a time in seconds, in file order, without comments and empty lines.
 
     Commas and tabs count as spaces. Raises SourceError naming file and line.
     """
     try:
         text = read_text(path, MAX_LIST, "replace")
     except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
+        raise SourceError(f"{path}: {error.strerror}; give a readable file") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
 
 
 def inside(name: str, where: str) -> str:
-    """Return the name of a file that a line of a list gives; raises SourceError if it leads out of the folder."""
+    """Return the file name in a line of a list; raises SourceError if it leads out of the folder."""
     if os.path.isabs(name) or ".." in PurePath(name).parts or "\0" in name:
         raise SourceError(f"{where}: '{name}' leads out of the recording's folder; put the file there and name it so")
     return name
 
 
 def by_time(lines: Iterable[StampedLine]) -> list[StampedLine]:
-    """Return the lines sorted by time, only the first of those with the same stamp."""
+    """Return the lines sorted by time, with only the first of those with the same stamp."""
     first: dict[int, StampedLine] = {}
     for line in lines:
         first.setdefault(line[0], line)
@@ -124,15 +125,15 @@ def by_time(lines: Iterable[StampedLine]) -> list[StampedLine]:
 def ns_from_seconds(text: str) -> int:
     """Return the exact nanoseconds of a decimal number of seconds; digits beyond the ninth are rounded.
 
-    A float would be off by up to 120 ns for today's dates. Raises ValueError for what is no number or too large for
+    A float would be off by up to 120 ns for today's dates. Raises ValueError if it is not a number or too large for
     int64.
     """
     try:
         seconds = Decimal(text)
     except InvalidOperation:
-        raise ValueError(f"'{text}' is no time in seconds") from None
+        raise ValueError(f"'{text}' is not a time in seconds") from None
     if not (seconds.is_finite() and -LIMIT < seconds < LIMIT):  # abs() may overflow
-        raise ValueError(f"'{text}' is no time in seconds")
+        raise ValueError(f"'{text}' is not a time in seconds")
     return round(seconds * 1_000_000_000)
 
 

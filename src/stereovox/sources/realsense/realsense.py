@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connected RealSense depth camera (D400 series), read live; recorded files are `bags.recording`'s."""
+"""A connected RealSense depth camera (D400 series), read live; for recorded files see `bags.recording`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WAITING = 2
 """Frames kept while the map is busy; older ones are dropped, so that the map never lags behind the camera."""
 PATIENCE_MS = 5000
 PREFERRED = (848, 480, 30)
-"""Width, height, frames a second: where the D435 measures best, and what Chien 2020 used."""
+"""Width, height, frames a second: the D435's most accurate mode, used by Chien 2020."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Options:
     """Options after the name, as in `realsense:?width=848&height=480&fps=30`; 0 or -1: the camera's own.
 
     width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
-    baseline: metres between the two infrared cameras, where the camera does not report it. pose: `fixed` for a camera
+    baseline: metres between the two infrared cameras, if the camera does not report it. pose: `fixed` for a camera
     at rest; every pose is then the identity. imu: `off` to leave gyroscope and accelerometer out. photo: `off` to leave
     the colour camera out.
     """
@@ -64,16 +64,16 @@ class Options:
 
 
 class RealSense(Stream):
-    """Depth images of a connected camera, from now on, until nobody asks for more: it has no length and no frame(i).
+    """Depth images of a connected camera, from now until the consumer stops: it has no length and no frame(i).
 
-    location: `realsense:` or, where several are connected, `realsense:SERIAL`; see `Options` for what may follow.
-    context: what lists the devices; pyrealsense2's own unless a test brings another.
-    Pixels without value are 0, whatever the reason: all are UNKNOWN, none clears.
-    Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
-    `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
+    location: `realsense:` or, if several are connected, `realsense:SERIAL`; `Options` may follow.
+    context: lists the devices; pyrealsense2's own unless a test replaces it.
+    Invalid pixels are 0, whatever the reason: all are UNKNOWN and clear nothing.
+    Time: the frame's, in the clock domain of the camera. Camera, unit and baseline come from the device. Without
+    `pose=fixed` every frame has the fault `no_pose`, but keeps its depth: a camera does not know its pose,
     and pyrealsense2 2.55 and later no longer supports the T265.
     Raises MissingExtra without pyrealsense2; SourceError if no camera or not the right one is connected,
-    for modes and settings that it does not have, and while frames are taken, where none came for 5 s.
+    for unsupported modes and settings, and during capture if no frame arrives for 5 s.
     """
 
     layout = "a connected RealSense camera (realsense: or realsense:SERIAL)"
@@ -81,7 +81,7 @@ class RealSense(Stream):
     def __init__(self, location: str, context: Any = None):
         self._rs = library()
         serial, self.options = _parse(location)
-        location = location.removesuffix(":")  # what messages begin with
+        location = location.removesuffix(":")  # start of messages
         try:
             self._device = _device(self._rs, context or self._rs.context(), location, serial)
             self._sensor = _depth_sensor(self._device, location)
@@ -97,7 +97,7 @@ class RealSense(Stream):
         self._photos = self._beside("colour camera", self.options.photo, find_photos)
 
     def _beside(self, what: str, option: str, find: Callable[[Any, Any, Any], T | None]) -> T | None:
-        """Return a sensor that helps to track, None if missing, or the camera does not say where it is."""
+        """Return a sensor that helps tracking, None if it is missing or its mount is unknown."""
         if self.posed or option == "off":
             return None
         try:
@@ -140,7 +140,7 @@ class RealSense(Stream):
             self._stop()
 
     def _ready(self, images: int) -> bool:
-        """Read the IMU; return whether it has said enough for an image to count, after so many."""
+        """Read the IMU; return whether it has enough readings for an image to count, or `images` have waited."""
         if self._motion is None:
             return True
         self._motion.read()
@@ -153,13 +153,13 @@ class RealSense(Stream):
         stopped(self._sensor)
 
     def _frame(self, image: Any) -> Frame:
-        depth = np.array(image.get_data())  # a copy: the library uses its memory again
+        depth = np.array(image.get_data())  # a copy: the library reuses its memory
         stamp_ns = ns_from_ms(image.get_timestamp())
         name = f"{self.name} frame {image.get_frame_number()}"
         unit = float(image.as_depth_frame().get_units())
         if self.options.pose == "fixed":
             return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name, sensor=self.name)
-        detail = f"{name}: the camera does not know where it is; add ?pose=fixed if it stands still, else record it"
+        detail = f"{name}: the camera does not know its pose; add ?pose=fixed if it stands still, else record it"
         detail += " and put poses next to the recording in a camera pair (pair.toml)"
         return Frame(
             depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
@@ -194,7 +194,7 @@ def _device(rs: Any, context: Any, location: str, serial: str) -> Any:
             raise SourceError(f"{location}: not connected; there is {_device_names(devices)}")
         return devices[serial]
     if len(devices) > 1:
-        raise SourceError(f"{location}: several cameras are connected, say which: {_device_names(devices)}")
+        raise SourceError(f"{location}: several cameras are connected, choose one: {_device_names(devices)}")
     return next(iter(devices.values()))
 
 
@@ -211,11 +211,11 @@ def _depth_sensor(device: Any, location: str) -> Any:
     for sensor in device.query_sensors():
         if sensor.is_depth_sensor():
             return sensor
-    raise SourceError(f"{location}: this camera has no depth sensor; give the serial number of one that has")
+    raise SourceError(f"{location}: this camera has no depth sensor; give the serial number of one with a depth sensor")
 
 
 def _profile(rs: Any, sensor: Any, options: Options, location: str) -> Any:
-    """Return the requested mode; what was not requested is as in PREFERRED, or near it."""
+    """Return the requested mode; unspecified values are PREFERRED or as near as possible."""
     modes = {}
     for profile in sensor.get_stream_profiles():
         if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16:
@@ -238,7 +238,7 @@ def _apply(rs: Any, sensor: Any, options: Options, location: str) -> None:
         if value < 0:
             continue
         if not sensor.supports(option):
-            raise SourceError(f"{location}: this camera has no {key} to set; leave {key}= out")
+            raise SourceError(f"{location}: this camera has no setting {key}; leave {key}= out")
         try:
             sensor.set_option(option, float(value))
         except RuntimeError:
@@ -247,7 +247,7 @@ def _apply(rs: Any, sensor: Any, options: Options, location: str) -> None:
 
 
 def _baseline(rs: Any, sensor: Any) -> float | None:
-    """Return the metres between the infrared cameras: as the sensor says, else from their extrinsics."""
+    """Return the metres between the infrared cameras: from the sensor, else from their extrinsics."""
     if sensor.supports(rs.option.stereo_baseline):
         return sensor.get_option(rs.option.stereo_baseline) / 1000 or None
     eyes = {
@@ -267,7 +267,7 @@ def _baseline(rs: Any, sensor: Any) -> float | None:
 def _camera(profile: Any, baseline: float | None, location: str) -> tuple[PinholeCamera, tuple[str, ...]]:
     intrinsics = profile.get_intrinsics()
     numbers = (intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
-    note = f"{location}: the camera tells of lens distortion in its depth, which is not corrected"
+    note = f"{location}: the camera reports lens distortion in its depth, which is not corrected"
     try:
         return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(
             intrinsics.coeffs

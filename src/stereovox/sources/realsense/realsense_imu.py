@@ -11,17 +11,17 @@ from stereovox.sources.realsense.realsense_sensor import SideSensor, ns_from_ms,
 WAITING = 2000
 """Readings that may wait for the next image."""
 FIRST_S, FIRST_IMAGES = 0.5, 30
-"""Images wait until the IMU has spoken for so long, to tell which way is up; so many at most."""
+"""Images wait until the IMU has run this long, to give the up direction; at most this many images."""
 
 
 class MotionSensor(SideSensor):
-    """Fills a `LiveImu` with what the camera's motion sensor measures.
+    """Fills a `LiveImu` with the camera's motion readings.
 
     Args:
         rs: The library.
         sensor: The camera's motion sensor.
-        profiles: Its modes by stream: `gyro` and, where there is one, `accel`.
-        imu: What is filled.
+        profiles: Its modes by stream: `gyro` and, if available, `accel`.
+        imu: The IMU to fill.
     """
 
     def __init__(self, rs: Any, sensor: Any, profiles: dict[str, Any], imu: LiveImu):
@@ -29,7 +29,7 @@ class MotionSensor(SideSensor):
         self.imu = imu
 
     def read(self) -> None:
-        """Take in what was measured since."""
+        """Add the readings since the last call."""
         while self._queue is not None and (reading := self._queue.poll_for_frame()):
             data = reading.as_motion_frame().get_motion_data()
             kind = reading.get_profile().stream_type()

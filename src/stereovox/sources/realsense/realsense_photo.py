@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The colour camera of a connected RealSense, whose pictures help to track it."""
+"""The colour camera of a connected RealSense, whose pictures help tracking."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from stereovox.sources.realsense.realsense_sensor import SideSensor, ns_from_ms,
 from stereovox.sources.rgbd.undistort import Undistortion
 
 WAITING = 6
-"""Newest pictures that are kept for those who track or record depth images a little later."""
+"""Number of newest pictures that are kept for tracking or recording depth images a little later."""
 WITHIN_NS, PATIENCE_MS = 20_000_000, 15
-"""How far a picture may be from its depth image, and how long one that is late is waited for."""
+"""Largest time between a picture and its depth image, and longest wait for a late picture."""
 PREFERRED = (640, 480)
 """Width and height."""
 GREY_FROM: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
@@ -33,20 +33,20 @@ GREY_FROM: dict[str, Callable[[NDArray[np.uint8]], NDArray[np.uint8]]] = {
     "rgb8": lambda data: data,
     "bgr8": lambda data: data[..., ::-1],
 }
-"""Forms that a colour camera may send, the cheapest first, and what is made of each: a grey or an RGB image."""
+"""Formats of a colour camera, the cheapest first, with a conversion of each to a grey or RGB image."""
 
 
 class PhotoSensor(SideSensor):
-    """Returns the picture that was taken with a depth image.
+    """Returns the picture taken with a depth image.
 
     Args:
         rs: The library.
         sensor: The colour camera's sensor.
         profile: Its mode.
-        T_depth_photo: (4, 4), maps its optical frame into that of the depth camera.
+            T_depth_photo: (4, 4), maps its optical frame into the depth camera's.
 
-    Raises:
-        RuntimeError, StereovoxError: The camera does not say how it sees.
+        Raises:
+            RuntimeError, StereovoxError: The camera's intrinsics are missing or invalid.
     """
 
     def __init__(self, rs: Any, sensor: Any, profile: Any, T_depth_photo: Transform):
@@ -54,22 +54,24 @@ class PhotoSensor(SideSensor):
         self._T = T_depth_photo
         lens = profile.get_intrinsics()
         self.camera = PinholeCamera(lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy)
-        self._undistort = Undistortion(self.camera, lens.coeffs)  # RealSense's ROS driver takes them so too
+        self._undistort = Undistortion(
+            self.camera, lens.coeffs
+        )  # RealSense's ROS driver interprets them in the same way
         self._grey = GREY_FROM[_form(rs, profile)]
         self._waiting: deque[tuple[int, Any]] = deque(maxlen=WAITING)
         self._lock = Lock()
 
     def stop(self) -> None:
-        """Stop taking pictures, and give those that wait back to the library."""
+        """Stop taking pictures, and return waiting ones to the library."""
         with self._lock:
             self._waiting.clear()
         super().stop()
 
     def near(self, stamp_ns: int) -> Photo:
-        """Return the picture nearest to a depth image of that time, which is read once it is needed.
+        """Return the picture nearest to a depth image of that time; it is read when needed.
 
-        Its `pixels` wait for 15 ms where only earlier ones have come; they raise FrameRefused if none is within
-        20 ms, or is kept no more.
+        Its `pixels` wait for 15 ms if only earlier ones have arrived; they raise FrameRefused if none is within
+        20 ms, or it is no longer kept.
         """
         return Photo(cache(partial(self._pixels, stamp_ns)), self.camera, self._T)
 
@@ -85,10 +87,10 @@ class PhotoSensor(SideSensor):
         size = self.camera.height, self.camera.width
         data = np.ascontiguousarray(image.get_data()).view(np.uint8).reshape(*size, -1)
         grey = self._grey(data if data.shape[2] > 1 else data[..., 0])
-        return np.array(self._undistort(grey))  # a copy: the library uses its memory again
+        return np.array(self._undistort(grey))  # a copy: the library reuses its memory
 
     def _take(self, stamp_ns: int) -> None:
-        """Take in pictures that came, and wait for one that is not older than `stamp_ns`."""
+        """Collect pictures that arrived, and wait for one that is not older than `stamp_ns`."""
         until = monotonic() + PATIENCE_MS / 1000
         while True:
             while image := self._queue.poll_for_frame():
@@ -104,7 +106,7 @@ class PhotoSensor(SideSensor):
 def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
     """Return the colour camera next to a depth camera, in a mode of its rate; None if missing.
 
-    Raises RuntimeError and StereovoxError if the camera does not say how it sees or where it is.
+    Raises RuntimeError and StereovoxError if the camera's intrinsics or mount are unknown.
     """
     modes = [
         (sensor, profile.as_video_stream_profile())
@@ -125,5 +127,5 @@ def find_photos(rs: Any, device: Any, depth_profile: Any) -> PhotoSensor | None:
 
 
 def _form(rs: Any, profile: Any) -> str:
-    """Return the name of a mode's form, nothing if no picture can be made of it."""
+    """Return the name of a mode's format, "" if it is not supported."""
     return next((name for name in GREY_FROM if profile.format() == getattr(rs.format, name)), "")

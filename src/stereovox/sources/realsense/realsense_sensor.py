@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the sensors of a connected RealSense camera have in common: starting, stopping, times and places."""
+"""Common parts of the sensors of a connected RealSense camera: starting, stopping, times and mounts."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stereovox.geometry.se3 import Transform
 
 
 class SideSensor:
-    """A sensor next to the depth camera, without which tracking goes on.
+    """A sensor next to the depth camera; tracking continues without it.
 
     Args:
         rs: The library.
         sensor: The sensor.
         profiles: Its modes.
-        waiting: Readings that may wait.
+        waiting: Capacity of the queue of readings.
     """
 
     def __init__(self, rs: Any, sensor: Any, profiles: Sequence[Any], waiting: int):
@@ -27,7 +27,7 @@ class SideSensor:
         self._queue: Any = None
 
     def start(self) -> bool:
-        """Start measuring; return whether the camera does."""
+        """Start measuring; return whether it works."""
         self._queue = self._rs.frame_queue(self._capacity)
         try:
             self._sensor.open(self._profiles)
@@ -43,20 +43,20 @@ class SideSensor:
 
 
 def stopped(sensor: Any) -> None:
-    """Stop a sensor and close it, also one that was pulled out or never started."""
+    """Stop a sensor and close it, even if it was unplugged or never started."""
     for end in (sensor.stop, sensor.close):
         with suppress(RuntimeError):
             end()
 
 
 def ns_from_ms(milliseconds: float) -> int:
-    """Return whole nanoseconds; times 1e6 as a float, today's dates would be off by up to 128 ns."""
+    """Return integer nanoseconds; a float product with 1e6 would be off by up to 128 ns for today's dates."""
     whole, rest = divmod(milliseconds, 1.0)
     return int(whole) * 1_000_000 + round(rest * 1e6)
 
 
 def transform_between(one: Any, other: Any) -> Transform:
-    """Return T_other_one (4, 4) of two streams by the camera's own calibration; raises RuntimeError without one."""
+    """Return T_other_one (4, 4) of two streams from the camera's own calibration; raises RuntimeError without one."""
     T = np.eye(4)
     found = one.get_extrinsics_to(other)
     T[:3, :3] = np.reshape(found.rotation, (3, 3)).T  # librealsense stores rotations column by column

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images of confidence next to depth images, as ARKit gives them: 0 low, 1 medium, 2 high."""
+"""Confidence images next to depth images, as in ARKit: 0 low, 1 medium, 2 high."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def without_low(depth: Depth, path: Path, lowest: int) -> Depth:
 
     Args:
         depth: (height, width) in any unit.
-        path: 8-bit grey PNG of the same size, values growing with the confidence; without it all is kept.
-        lowest: Least confidence that is kept.
+            path: 8-bit grey PNG of the same size, values growing with the confidence; without it all is kept.
+            lowest: Smallest confidence that is kept.
 
-    Returns:
-        (height, width), of the same type; 0 has no value.
+        Returns:
+            (height, width), of the same type; 0 is invalid.
 
     Raises:
-        FrameRefused: `unreadable`, `bad_dtype` or `bad_shape` of the image of confidence.
+        FrameRefused: `unreadable`, `bad_dtype` or `bad_shape` of the confidence image.
     """
     try:
         content = read_bounded(path, MAX_BYTES)

@@ -27,13 +27,13 @@ from stereovox.sources.images import GREY_16, MAX_BYTES, SIGNATURE, decode_png, 
 SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
 """Suffixes of depth images, in lower case."""
 PACKED_KINDS = frozenset({(8, 2), (8, 6)})
-"""8-bit RGB and RGBA, whose bytes may be those of a depth."""
+"""8-bit RGB and RGBA, whose bytes may encode depth."""
 FLOAT_TOP = (58, 71)
 """Smallest and largest leading byte of float32 depths from 1 mm to 100 km (the sky of simulators)."""
 CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
 """CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
 COUNTS, FEWEST, ROUGH = 0.03, 20, 0.1
-"""Share of such neighbours in packed depth (photos have none at all), fewest to tell by, most relative step."""
+"""Required share of such neighbours in packed depth (photos have none), their minimum number, largest relative step."""
 KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
 COLMAP = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 """Start of COLMAP's depth maps: columns, rows and channels; then float32 row by row."""
@@ -49,11 +49,11 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
 
     Args:
         path: The file.
-        size: (width, height) that it must have.
+        size: Required (width, height).
 
     Returns:
-        (height, width) uint16, or float32 where the file holds floats or larger integers; in the file's unit. Negative
-        integers become 0, no value.
+            (height, width) uint16, or float32 if the file has floats or larger integers; in the file's unit. Negative
+            integers become 0, which is invalid.
 
     Raises:
         FrameRefused: `missing_file`; `unreadable` (cut off, damaged, absurdly large); `bad_dtype` (a picture);
@@ -77,7 +77,7 @@ def depth_size(path: Path) -> tuple[int, int]:
 def common_depth_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int] | str:
     """Return the most frequent (width, height) of readable images spread over `paths`.
 
-    Where none is readable: what is wrong with the first.
+    If none is readable: the fault of the first.
     """
     found: Counter[tuple[int, int]] = Counter()
     fault = "there is no image"
@@ -94,7 +94,7 @@ def common_depth_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int
 def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None) -> Depth:
     """Return the depth image in the bytes of a file, as `read_depth` does; `path` names it in messages.
 
-    size: (width, height) that a PNG must have; None: any.
+    size: required (width, height) of a PNG; None: any.
     """
     if content.startswith(SIGNATURE):
         return _depth(path, _png(path, content, size))
@@ -103,7 +103,7 @@ def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None
     for start, decode in DECODERS.items():
         if content.startswith(start):
             return _depth(path, decode(path, content))
-    raise FrameRefused("unreadable", f"{path}: no depth image of a known kind ({', '.join(SUFFIXES)})")
+    raise FrameRefused("unreadable", f"{path}: not a depth image of a known kind ({', '.join(SUFFIXES)})")
 
 
 def _read(path: Path) -> bytes:
@@ -144,7 +144,7 @@ def _unpacked(path: Path, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         top = image[..., 3]
         used = top > 0
         if used.any() and np.mean((top[used] >= FLOAT_TOP[0]) & (top[used] <= FLOAT_TOP[1])) > 0.99:
-            orders = [(blue, red), (red, blue)]  # of OpenCV (RTAB-Map), and of programs that write R first
+            orders = [(blue, red), (red, blue)]  # OpenCV's (RTAB-Map), and that of programs that write R first
             made = [(low | green << 8 | high << 16 | top.astype(np.uint32) << 24) for low, high in orders]
             return min((bits.view(np.float32) for bits in made), key=_roughness)
     code = red + 256 * green + 65536 * blue
@@ -161,9 +161,10 @@ def _roughness(depth: NDArray[np.generic]) -> float:
 
 
 def _counts_over(high: NDArray[np.uint32], low: NDArray[np.uint32]) -> float:
-    """Return in how many neighbours whose `high` byte differs by one the `low` byte starts anew, as in a number.
+    """Return the share of neighbours whose `high` bytes differ by one and whose `low` byte carries over, as in a
+    number.
 
-    0 where there are too few such neighbours to tell.
+    0 if there are too few such neighbours.
     """
     found = []
     for axis in (0, 1):
@@ -179,7 +180,7 @@ def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
 
     _check_pixels(path, _tiff_pixels(content))
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # else a damaged file writes to the terminal
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # or a damaged file prints on the terminal
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -192,7 +193,7 @@ def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
 
 
 def _tiff_pixels(content: bytes) -> int:
-    """Return width times height times samples by the first directory of a TIFF; 0 if it cannot be read."""
+    """Return width times height times samples from the first directory of a TIFF; 0 if unreadable."""
     order: Literal["little", "big"] = "little" if content.startswith(b"II") else "big"
     start = int.from_bytes(content[4:8], order)
     told = {256: 0, 257: 0, 277: 1}  # width, height, samples
@@ -204,22 +205,22 @@ def _tiff_pixels(content: bytes) -> int:
 
 
 def _check_pixels(path: Path, pixels: int) -> None:
-    """Raise FrameRefused if a header claims no pixels, or more than are believed."""
+    """Raise FrameRefused if a header declares no pixels, or more than are accepted."""
     if not 0 < pixels <= MAX_PIXELS:
-        raise FrameRefused("unreadable", f"{path}: its header is damaged or tells of {pixels} pixels; remove it")
+        raise FrameRefused("unreadable", f"{path}: its header is damaged or declares {pixels} pixels; remove it")
 
 
 def _netpbm(path: Path, content: bytes) -> NDArray[np.generic]:
     """Return the image of a PGM (P5 binary, P2 text) or grey PFM (Pf, its lowest row first).
 
-    OpenCV fills up what is cut off.
+    OpenCV would fill missing rows of a truncated file.
     """
     header = HEADER.match(content)
     if header is None:
         raise FrameRefused("unreadable", f"{path}: its header is damaged; copy it again or remove it")
     kind, (width, height), most = header[1], (int(header[2]), int(header[3])), float(header[4])
     if not 0 < width * height <= MAX_PIXELS or not 0 < abs(most) < 65536:
-        raise FrameRefused("unreadable", f"{path}: its header tells of {width}x{height} pixels; remove it")
+        raise FrameRefused("unreadable", f"{path}: its header declares {width}x{height} pixels; remove it")
     order = "<" if kind == b"Pf" and most < 0 else ">"
     dtype = np.dtype(f"{order}f4" if kind == b"Pf" else ">u2" if most > 255 else "u1")
     rest = content[header.end() :]
@@ -264,9 +265,9 @@ def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
         return _squeezed(found[name])
     except FrameRefused:
         raise
-    except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
+    except Exception as error:  # a damaged file can raise anything in zipfile, zlib and NumPy
         why = " ".join(str(error).split())[:100]
-        raise FrameRefused("unreadable", f"{path}: no array of depths ({why}); save it again") from None
+        raise FrameRefused("unreadable", f"{path}: not an array of depths ({why}); save it again") from None
 
 
 def _squeezed(array: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -289,7 +290,7 @@ def _exr(path: Path, content: bytes) -> NDArray[np.generic]:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises plain RuntimeError and more
         why = " ".join(str(error).split())[:100]
-        raise FrameRefused("unreadable", f"{path}: no OpenEXR image that can be read ({why})") from None
+        raise FrameRefused("unreadable", f"{path}: not a readable OpenEXR image ({why})") from None
     named = next((name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth", "y", "v")), None)
     first = channels[named or next(iter(channels))]
     if named is None and any(not np.array_equal(first, other, equal_nan=True) for other in channels.values()):
@@ -307,4 +308,4 @@ DECODERS: dict[bytes, Callable[[Path, bytes], NDArray[np.generic]]] = {
     b"\x93NUMPY": _numpy,
     b"PK\x03\x04": _numpy,
 }
-"""By the first bytes of a file; PNG besides."""
+"""By the first bytes of a file; PNG is handled separately."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of depth images that do not say it: found by how well images agree with each other at their poses.
+"""The unit of depth images without one: found by how well images agree with each other at their poses.
 
-Poses are in metres. Where the camera moves sideways or forward, the points of one image fall onto the surfaces that
-another sees only if the depths are in the right unit; a turn alone says nothing.
+Poses are in metres. If the camera moves sideways or forward, the points of one image fall onto the surfaces in
+another only if the depths are in the right unit; a pure rotation does not constrain the unit.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ UNITS = {
 }
 """Usual units of depth images, in metres."""
 PAIRS, SEARCHED = 8, 60
-"""Pairs of images that are compared, and most images after the first of a pair in which the second is looked for."""
+"""Pairs of images that are compared, and most images after the first of a pair that are searched for the second."""
 MOVED_M, TURNED = 0.3, 0.5
-"""Metres that the camera should have moved between the images of a pair, and radians it may have turned."""
+"""Metres that the camera should have moved between the images of a pair, and most radians it may have turned."""
 POINTS_ACROSS = 80
-"""Points of an image, across, that are compared."""
+"""Points across an image that are compared."""
 CLEARLY = 0.8, 1.25
-"""A unit clearly beats another where it fits better in this share of the pairs, and so many times better altogether."""
+"""A unit clearly beats another if it fits better in this share of the pairs, and this many times better overall."""
 FEW_PAIRS = 1.0, 2.5
 """The same for fewer pairs than `MIN_PAIRS`."""
 MIN_PAIRS = 3
 OVERLAP = 0.2
-"""Share of an image's points that another must see for the two to be compared."""
+"""Share of an image's points that must be visible in another for a comparison."""
 STILL = 1e6
-"""A unit so large that no motion of the camera is seen."""
+"""A unit so large that the camera appears not to move."""
 WORST = 0.06
-"""Largest median difference of depths, relative, with which images fit together at all."""
+"""Largest median relative difference of depths of images that agree."""
 LIKELY_M = 0.25, 40.0
-"""Median depth in metres of a scene that a unit is plausible for, if there is nothing else to go by."""
+"""Plausible median depths of a scene in metres, used if there is no other evidence."""
 
 
 class DepthUnit(NamedTuple):
     """Unit of depth images.
 
-    scale: metres per unit. sure: whether the images themselves confirm it. why: what speaks for it, in words.
-    plausible: whether half of the depths are nearer than a distance that scenes usually have.
+    scale: metres per unit. sure: whether the images themselves confirm it. why: the evidence, in words.
+    plausible: whether the median depth is one that scenes usually have.
     """
 
     scale: float
@@ -87,14 +87,14 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
     Args:
         pairs: Images of the same place, see `pairs_of`.
         camera: The camera of all.
-        expected: Metres per unit by convention, kept where the images do not contradict it.
+        expected: Metres per unit by convention, kept unless the images contradict it.
 
     Returns:
-        The unit: another than `expected` only where it is sure, and half the depths are not kilometres away: images
+        The unit: other than `expected` only if it is certain, and half the depths are not kilometres away: images
         in millimetres whose poses are in millimetres too agree in metres.
     """
     units = [expected, *(unit for unit in UNITS if abs(unit / expected - 1) > 1e-6)]
-    tried = [*units, STILL]  # last: as if the camera had not moved, which noise of the poses favours
+    tried = [*units, STILL]  # last: as if the camera had not moved, which pose noise favours
     medians = np.array([[_median(first, second, camera, unit) for unit in tried] for first, second in pairs])
     if not len(pairs) or not np.isfinite(medians).any():
         return _unchecked(pairs, expected)
@@ -119,7 +119,7 @@ def _percent(share: float) -> str:
 
 
 def _beats(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    """Return whether the medians (pairs,) of one unit are clearly less than those of another."""
+    """Return whether the medians (pairs,) of one unit are clearly less than another's."""
     wins, less = CLEARLY if len(one) >= MIN_PAIRS else FEW_PAIRS
     return bool(np.mean(one < other) >= wins and less * np.median(one) < np.median(other))
 
@@ -136,12 +136,12 @@ def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int],
             if second is not None:
                 found.append((View(read(first), pose(first)), View(read(second), pose(second))))
         except FrameRefused:
-            continue  # it is reported when its turn comes
+            continue  # reported when it is read
     return found
 
 
 def _second(first: int, count: int, pose: Callable[[int], Transform]) -> int | None:
-    """Return the number of the next image that was taken far enough away, None if missing."""
+    """Return the number of the next image taken far enough away, None if there is none."""
     best, farthest = None, 0.1 * MOVED_M
     try:
         start = _numbers(pose(first))
@@ -166,7 +166,7 @@ def _numbers(T: Transform) -> tuple[float, ...]:
 
 
 def _median(first: View, second: View, camera: PinholeCamera, unit: float) -> float:
-    """Return the median relative difference of what two images show of the same points; inf where they share few."""
+    """Return the median relative difference of two images at their common points; inf if they share few."""
     T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
     differences, points = difference(first.depth, second.depth, camera, T_second_first, unit)
     return float(np.median(differences)) if len(differences) > OVERLAP * points else np.inf
@@ -175,10 +175,10 @@ def _median(first: View, second: View, camera: PinholeCamera, unit: float) -> fl
 def difference(
     depth: Depth, other: Depth, camera: PinholeCamera, T_other_this: Transform, unit: float
 ) -> tuple[NDArray[np.float64], int]:
-    """Return by how much the depths of points of one image differ from what another image shows there.
+    """Return the relative differences between the depths of one image's points and another image.
 
     depth, other: (height, width), times `unit` metres; 0, negative, not finite and 65535 in uint16: no value.
-    Returns relative differences (K,) of the points that both show, and the number of points of the first.
+    Returns the differences (K,) of common points, and the number of points of the first.
     """
     step = max(1, depth.shape[1] // POINTS_ACROSS)
     v, u = (index.ravel() for index in np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step])
@@ -203,7 +203,7 @@ def _usable(depth: Depth) -> NDArray[np.bool_]:
 
 
 def is_likely(pairs: Sequence[tuple[View, View]], unit: float) -> bool:
-    """Return whether half the depths are as far away as those of scenes usually are."""
+    """Return whether the median depth is usual for a scene."""
     return LIKELY_M[0] <= _middle(pairs, unit) <= LIKELY_M[1]
 
 
@@ -214,7 +214,7 @@ def _middle(pairs: Sequence[tuple[View, View]], unit: float) -> float:
 
 
 def _unchecked(pairs: Sequence[tuple[View, View]], expected: float) -> DepthUnit:
-    """Return the expected unit, with what the range of the depths says about it."""
+    """Return the expected unit, judged by the range of the depths."""
     middle = _middle(pairs, expected)
     if np.isnan(middle):
         return DepthUnit(expected, False, "no two posed images are far enough apart to check it")

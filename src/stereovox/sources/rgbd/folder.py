@@ -36,7 +36,7 @@ from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 
 SECOND = 1_000_000_000
 PHOTO_NS, PHOTOS_TRIED = 20_000_000, 5
-"""How far a picture may be in time from its depth image, and how many are looked at for their size."""
+"""Largest time between a picture and its depth image, and how many pictures are tried for their size."""
 
 
 class ImageFile(NamedTuple):
@@ -48,15 +48,15 @@ class ImageFile(NamedTuple):
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """What may stand behind a folder's name, as in `scan?depth_scale=1000&poses=trajectory.log`.
+    """Options behind a folder's name, as in `scan?depth_scale=1000&poses=trajectory.log`.
 
-    depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: as the layout has it, checked against
-        the poses). camera: file of the camera, in place of the layout's own (see `camera_in`). fps: images a second
-        where they have no times (0: the layout's). poses: file or folder of poses in place of the layout's own (see
+    depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: the layout's, checked against
+        the poses). camera: file of the camera, instead of the layout's own (see `camera_in`). fps: images a second
+        if they have no times (0: the layout's). poses: file or folder of poses instead of the layout's own (see
         `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward), `ros` or
         `ned`. invert: whether poses are world to camera. poses_scale: metres per unit of the poses' positions (0.001:
         millimetres).
-    File names are looked up as they stand, then inside the folder.
+    File names are searched as given, then inside the folder.
     """
 
     depth_scale: float = 0.0
@@ -98,23 +98,24 @@ def folder_options(where: str | os.PathLike[str]) -> tuple[Path, FolderOptions]:
 class DepthFolder(DepthSource, ABC):
     """Frames from depth images, one file each; an unusable file becomes a frame with a `fault`.
 
-    A layout lists its images and reads its poses; what it does not say otherwise is looked for: the camera next to the
-    images, the unit by convention and by how images agree with each other (see `depth_unit`). The options behind the
-    folder's name come before all of it (see `FolderOptions`).
-    Pixels hold 0, 65535, NaN or infinity if there is no value, without a reason: all are UNKNOWN, none clears.
+    A layout lists its images and reads its poses; anything else is searched for: the camera next to the
+    images, the unit by convention and by how well images agree (see `depth_unit`). Options behind the
+    folder's name take precedence (see `FolderOptions`).
+    Invalid pixels are 0, 65535, NaN or infinity, without a reason: all are UNKNOWN and clear nothing.
     Faults: those of `read_depth`, and `no_pose` and `bad_pose_file`.
     Raises SourceError if there is no readable image, no camera or no poses.
 
     Attributes:
         depth_scale: Metres per unit of integer images, by convention; floats are metres.
         baseline: Metres between the eyes of the sensor, None if unknown.
-        intrinsics: fx, fy, cx, cy of 640x480 images, or by size, without a file of the camera; None: there must be one.
-        axes: Axes of the posed camera.
-        fps: Images a second, where they have no times.
-        calibrations: Names of files of the camera, in order of preference.
-        certain: Whether all who write this layout use its unit; else a unit that cannot be checked leaves a note.
-        posed: Whether anything is known about poses; False, or given as False: all are NaN.
-        unit: The unit of the images, and what speaks for it.
+            intrinsics: fx, fy, cx, cy of 640x480 images, or by size, for use without a camera file; None: a file is
+            required.
+            axes: Axes of the posed camera.
+            fps: Images a second, if they have no times.
+            calibrations: Names of camera files, in order of preference.
+            certain: Whether all writers of this layout use its unit; else a unit that cannot be checked gives a note.
+            posed: Whether anything is known about poses; if False, all are NaN.
+            unit: The unit of the images, and its evidence.
     """
 
     depth_scale: float = 0.001
@@ -132,7 +133,7 @@ class DepthFolder(DepthSource, ABC):
         self.folder, self.options = folder_options(where)
         self.name = self.folder.resolve().name
         if self.options.poses or self.options.axes or self.options.invert:
-            self.up = None  # what the layout says is about its own poses
+            self.up = None  # the layout's up holds only for its own poses
         self.axes, self.fps = self.options.axes or self.axes, self.options.fps or self.fps
         self._reading = Reading(self.axes, self.options.invert, self.options.poses_scale)
         self._images = self.list_images()
@@ -150,7 +151,7 @@ class DepthFolder(DepthSource, ABC):
 
     @classmethod
     def depth_only(cls, where: str) -> DepthFolder:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return cls(where, posed=False)
 
     @abstractmethod
@@ -162,11 +163,11 @@ class DepthFolder(DepthSource, ABC):
         return None
 
     def numbers(self) -> list[int]:
-        """Return the numbers of the images, those in the names of their files; -1 if there is none."""
+        """Return the numbers in the names of the image files; -1 if there is none."""
         return [number_in(image.path.name)[0] for image in self._images]
 
     def size(self) -> tuple[int, int]:
-        """Return (width, height) of the images; raises SourceError if none can be read."""
+        """Return (width, height) of the images; raises SourceError if no image is readable."""
         size = common_depth_size([image.path for image in self._images])
         if isinstance(size, str):
             raise SourceError(f"none of the {len(self)} depth images of {self.folder} can be read: {size}")
@@ -177,7 +178,7 @@ class DepthFolder(DepthSource, ABC):
         return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return pictures to which the depth images are registered, in any order; [] if there are none."""
+        """Return pictures that the depth images are registered to, in any order; [] if there are none."""
         return []
 
     def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
@@ -198,28 +199,28 @@ class DepthFolder(DepthSource, ABC):
 
     @cached_property
     def _photo_camera(self) -> tuple[PinholeCamera | None, Transform]:
-        """The camera of the pictures, by the first that can be read."""
+        """The camera of the pictures, from the first readable one."""
         paths = [path for path in self._photos if path is not None][:PHOTOS_TRIED]
         size = next(filter(None, map(photo_size, paths)), None)
         return (None, np.eye(4)) if size is None else self.photo_camera(size)
 
     @cached_property
     def _no_photos(self) -> str:
-        """Why not one of the pictures that are there can be used; "" if one can, and if there are none."""
+        """Why none of the existing pictures can be used; "" if one can, or there are none."""
         if not self._listed_photos or self._photo_camera[0] is not None:
             return ""
         path = next(filter(None, self._photos), None)
         if path is None:
-            return f"{self.folder}: no picture within {PHOTO_NS / 1e6:g} ms of a depth image; are they of one clock?"
+            return f"{self.folder}: no picture within {PHOTO_NS / 1e6:g} ms of a depth image; do they share a clock?"
         return f"{path}: not read, or no camera is known for its size; give pictures of the depth images' shape"
 
     def _refuse_photo(self) -> NDArray[np.uint8]:
         raise FrameRefused("no_photo", self._no_photos)
 
     def photo(self, i: int) -> Photo | None:
-        """Return the picture that was taken with frame `i` (0 to len - 1), None if missing.
+        """Return the picture taken with frame `i` (0 to len - 1), None if missing.
 
-        Where none of the recording's can be used, its `pixels` raise FrameRefused and say why.
+        If no picture of the recording can be used, its `pixels` raise FrameRefused with the reason.
         """
         if self._no_photos:
             return Photo(self._refuse_photo, self.camera)
@@ -236,7 +237,7 @@ class DepthFolder(DepthSource, ABC):
         return self._images[i]
 
     def pose_in_file(self, i: int) -> Transform:
-        """Return the pose (4, 4) of frame `i` just as it is given; raises FrameRefused if there is none."""
+        """Return the pose (4, 4) of frame `i` as in the file; raises FrameRefused if it is missing."""
         if isinstance(self._poses, ImagePoses):
             return self._poses.at(i)
         return np.full((4, 4), np.nan) if self._poses is None else self._poses.at(self._images[i].stamp_ns)
@@ -261,7 +262,7 @@ class DepthFolder(DepthSource, ABC):
         return read_depth(self._images[i].path, (self.camera.width, self.camera.height))
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i`; depth is (0, 0) and the pose NaN where the frame has a `fault`."""
+        """Return frame `i`; depth is (0, 0) and the pose NaN if the frame has a `fault`."""
         i = range(len(self))[i]
         path, stamp_ns = self.image(i)
         try:
@@ -280,9 +281,9 @@ class DepthFolder(DepthSource, ABC):
         return self.fitted(read_poses(self._file(self.options.poses)))
 
     def fitted(self, found: Poses | ImagePoses) -> Poses | ImagePoses:
-        """Return poses as they belong to the images: by number, by time, or one for each in order.
+        """Assign poses to the images: by number, by time, or one for each in order.
 
-        Raises SourceError if there are too few or too many and neither numbers nor times say which is whose.
+        Raises SourceError if their number differs and neither numbers nor times assign them.
         """
         numbers, known = self.numbers(), image_numbers(found)
         stamps = [image.stamp_ns for image in self._images]
@@ -295,7 +296,7 @@ class DepthFolder(DepthSource, ABC):
             first, last = self._images[0].stamp_ns, self._images[-1].stamp_ns
             if found.stamps_ns[0] <= last and first <= found.stamps_ns[-1]:
                 if invented:
-                    self.notes += (f"images are taken to be {self.fps:g} a second; else give {self.folder}?fps=15",)
+                    self.notes += (f"images are assumed to be {self.fps:g} a second; else give {self.folder}?fps=15",)
                 return found
         if len(found) != len(self):
             raise SourceError(
@@ -310,24 +311,24 @@ class DepthFolder(DepthSource, ABC):
         return self.find_camera(size)
 
     def _find_unit(self, expected: float) -> DepthUnit:
-        """Return the unit of the images; `expected`: metres per unit by convention, or as the camera's file says."""
+        """Return the unit of the images; `expected`: metres per unit by convention, or from the camera's file."""
         if self.options.depth_scale:
             return DepthUnit(metres_per_unit(self.options.depth_scale), True, "as ?depth_scale= says")
         pairs = pairs_of(len(self), self.pose, self.read) if self.posed else []
         return find_unit(pairs, self.camera, expected)
 
     def _unit_note(self, expected: float) -> tuple[str, ...]:
-        """Return a note where the unit is not the `expected` one, or could neither be checked nor is certain."""
+        """Return a note if the unit is not the `expected` one, or is neither checked nor certain."""
         unit, usual = self.unit, abs(self.unit.scale / expected - 1) < 1e-6
         if usual and unit.plausible and (unit.sure or self.certain or not self.posed):
             return ()
         contrary = "" if usual else f", not {unit_words(expected)}"
         override = f"else give {self.folder}?depth_scale={5000 if unit.scale == 0.001 else 1000}"
-        poses = "&poses_scale=0.001" if unit.sure and not unit.plausible else ""  # which agree in any common unit
-        return (f"depth is taken to be in {unit.words}{contrary} ({unit.why}); {override}{poses}",)
+        poses = "&poses_scale=0.001" if unit.sure and not unit.plausible else ""  # they agree in any common unit
+        return (f"depth is assumed to be in {unit.words}{contrary} ({unit.why}); {override}{poses}",)
 
     def _misfit(self, expected: float) -> tuple[str, ...]:
-        """Return a note where poses do not fit the images, whose unit is `expected` by convention."""
+        """Return a note if poses do not fit the images, whose unit is `expected` by convention."""
         confirmed = self.unit.sure and not self.options.depth_scale
         if not self.posed or confirmed:
             return ()
@@ -342,7 +343,7 @@ class DepthFolder(DepthSource, ABC):
         return type(self).pose_in_file is not DepthFolder.pose_in_file
 
     def _dtype(self) -> np.dtype[np.generic]:
-        """Return the type of the images, that of the first that can be read."""
+        """Return the type of the images, from the first readable one."""
         for i in range(len(self)):
             try:
                 return self.read(i).dtype
@@ -351,14 +352,14 @@ class DepthFolder(DepthSource, ABC):
         return np.dtype(np.uint16)
 
     def _file(self, text: str) -> Path:
-        """Return the file that an option names, see `parameters.file_of`."""
+        """Return the file named by an option, see `parameters.file_of`."""
         return parameters.file_of(text, self.folder if os.path.isdir(self.folder) else self.folder.parent)
 
 
 def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:
     """Return the images of a folder whose names match a regular expression, in the order of their numbers.
 
-    Their times are the numbers divided by `fps`, or, where all names are times (seconds with decimals, or 16 or more
+    Their times are the numbers divided by `fps`, or, if all names are times (seconds with decimals, or 16 or more
     digits of nanoseconds or microseconds), those.
     """
     names = [name for name in file_names(folder) if re.fullmatch(pattern, name, re.IGNORECASE)]

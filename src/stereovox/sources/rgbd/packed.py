@@ -33,7 +33,7 @@ MAX_FRAMES = 1_000_000
 
 
 class Piece(NamedTuple):
-    """A frame in a file: the place and bytes of its depth, and its pose (4, 4), or None if the file has none."""
+    """A frame in a file: offset and length of its depth, and its pose (4, 4), or None if the file has none."""
 
     offset: int
     length: int
@@ -43,8 +43,8 @@ class Piece(NamedTuple):
 class SensHeader(NamedTuple):
     """Header of a `.sens` file.
 
-    intrinsics: of the depth camera. size: (width, height) of depth. code: see `DEPTH_CODES`. scale: metres per unit.
-    frames: their number. start: place of the first.
+    intrinsics: the depth camera's. size: (width, height) of depth. code: see `DEPTH_CODES`. scale: metres per unit.
+    frames: their number. start: offset of the first.
     """
 
     intrinsics: Intrinsics
@@ -58,7 +58,7 @@ class SensHeader(NamedTuple):
 class PackedDepth(DepthFolder):
     """Depth images in one file; times are number / 30 Hz.
 
-    Raises SourceError for a file that is none. A file that ends early has the frames that are whole, with a note.
+    Raises SourceError for any other file. A truncated file gives its whole frames, with a note.
     """
 
     _size: tuple[int, int]
@@ -77,7 +77,7 @@ class PackedDepth(DepthFolder):
 
     @abstractmethod
     def index(self) -> list[Piece]:
-        """Return where the frames are, and set `_size`; raises SourceError."""
+        """Return the positions of the frames, and set `_size`; raises SourceError."""
 
     def numbers(self) -> list[int]:
         """Return the numbers of the images in the file."""
@@ -88,7 +88,7 @@ class PackedDepth(DepthFolder):
         return self._size
 
     def pose_in_file(self, i: int) -> Transform:
-        """Return the pose just as it is given; raises FrameRefused `no_pose`."""
+        """Return the pose as in the file; raises FrameRefused `no_pose`."""
         T = self._pieces[i].T_world_camera
         if self._poses is not None:
             return super().pose_in_file(i)
@@ -117,7 +117,7 @@ class PackedDepth(DepthFolder):
     def poses_beside(self, missing: str) -> Poses | ImagePoses:
         """Return the poses of the `.freiburg` of the same name next to the file, or of the only one there.
 
-        Raises NoPoses, which says what is `missing`, if there is none.
+        Raises NoPoses with the text `missing` if there is none.
         """
         beside = sorted(self.file.parent.glob(ICL_POSES))
         same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
@@ -129,8 +129,8 @@ class PackedDepth(DepthFolder):
 class SensFile(PackedDepth):
     """A ScanNet `.sens` file, or a folder with one: depth raw or zlib, camera to world for each frame.
 
-    Camera and unit are those of its header (its extrinsics are not used, nor are they by ScanNet's own reader). World:
-    that of the poses, z up after ScanNet's alignment only. Frames in which tracking was lost (-inf): `no_pose`.
+    Camera and unit are its header's (its extrinsics are not used, as in ScanNet's own reader). World:
+    the poses', z up only after ScanNet's alignment. Frames in which tracking was lost (-inf): `no_pose`.
     Raises SourceError if depth is packed as occi, which only ScanNet's program reads.
     """
 
@@ -143,7 +143,7 @@ class SensFile(PackedDepth):
         return path if path.is_file() else sorted(path.glob("*.sens"))[0]
 
     def index(self) -> list[Piece]:
-        """Return where the frames are; raises SourceError."""
+        """Return the positions of the frames; raises SourceError."""
         try:
             with self.file.open("rb") as file:
                 self._header = read_header(self.file, file)
@@ -168,7 +168,7 @@ class SensFile(PackedDepth):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is such a file by its name, or a folder with one."""
+        """Return whether `where` is named like such a file, or is a folder with one."""
         path = Path(folder_part(where))
         try:
             return path.is_file() if path.suffix.lower() == ".sens" else any(path.glob("*.sens"))
@@ -179,14 +179,14 @@ class SensFile(PackedDepth):
 class SlambenchRaw(PackedDepth):
     """A SLAMBench `.raw` file: for each frame width, height, uint16 mm, and again width, height, 8-bit RGB.
 
-    Poses: `?poses=FILE`, or a `.freiburg` next to it. The scenes are those of ICL-NUIM, whose poses are left-handed
-    (see `icl_nuim`), and so is its camera the default for 640x480.
+    Poses: `?poses=FILE`, or a `.freiburg` next to it. The scenes are ICL-NUIM's, whose poses are left-handed
+    (see `icl_nuim`), and whose camera is the default for 640x480.
     """
 
     layout = "a SLAMBench .raw file"
 
     def index(self) -> list[Piece]:
-        """Return where the frames are; raises SourceError."""
+        """Return the positions of the frames; raises SourceError."""
         self._size, frames, whole = _raw_layout(self.file)
         width, height = self._size
         step = 16 + 5 * width * height
@@ -196,7 +196,7 @@ class SlambenchRaw(PackedDepth):
 
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses next to the file."""
-        return self.poses_beside("has no poses, nor is one .freiburg next to it; add ?poses=FILE")
+        return self.poses_beside("has no poses, and there is no .freiburg next to it; add ?poses=FILE")
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of a file next to it, else ICL-NUIM's."""
@@ -206,7 +206,7 @@ class SlambenchRaw(PackedDepth):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a file `.raw` whose size fits the frames its first bytes tell of."""
+        """Return whether `where` is a file `.raw` whose size fits the frames declared in its first bytes."""
         path = Path(folder_part(where))
         try:
             return path.suffix.lower() == ".raw" and path.is_file() and _raw_layout(path)[1] > 0
@@ -215,12 +215,12 @@ class SlambenchRaw(PackedDepth):
 
 
 def read_header(path: Path, file: BinaryIO) -> SensHeader:
-    """Read the header of a `.sens` file; raises SourceError with what is wrong."""
+    """Read the header of a `.sens` file; raises SourceError with the problem."""
     try:
         version, length = struct.unpack("<IQ", file.read(12))
         if version != VERSION or length > MAX_NAME:
             raise SourceError(
-                f"{path}: no .sens file of version {VERSION}; export its images with ScanNet's SensReader"
+                f"{path}: not a .sens file of version {VERSION}; export its images with ScanNet's SensReader"
             )
         file.seek(length, os.SEEK_CUR)
         matrices = np.array(struct.unpack("<64f", file.read(256)), float).reshape(4, 4, 4)
@@ -232,7 +232,7 @@ def read_header(path: Path, file: BinaryIO) -> SensHeader:
         packed = DEPTH_CODES.get(code, f"code {code}")
         raise SourceError(f"{path}: depth is packed as {packed}; export its images with ScanNet's SensReader")
     if not 0 < width * height <= MAX_PIXELS or frames > MAX_FRAMES or not 0 < shift < 1e6:
-        raise SourceError(f"{path}: tells of {frames} frames of {width}x{height}, 1/{shift:g} m; copy it again")
+        raise SourceError(f"{path}: declares {frames} frames of {width}x{height}, 1/{shift:g} m; copy it again")
     depth = matrices[2]
     if not np.isfinite(depth[:2, :3]).all():
         raise SourceError(f"{path}: its camera is NaN or infinite; add ?camera=FILE")
@@ -257,7 +257,7 @@ def _pieces(file: BinaryIO, header: SensHeader, end: int) -> list[Piece]:
 
 
 def _raw_layout(path: Path) -> tuple[tuple[int, int], int, bool]:
-    """Return (width, height), the number of frames, and whether the last is whole; raises SourceError for none."""
+    """Return (width, height), the number of frames, and whether the last is whole; raises SourceError if invalid."""
     try:
         with path.open("rb") as file:
             width, height = struct.unpack("<2I", file.read(8))
@@ -266,7 +266,7 @@ def _raw_layout(path: Path) -> tuple[tuple[int, int], int, bool]:
             file.seek(8 + 2 * width * height)
             second = file.read(8)
     except (OSError, struct.error, OverflowError, ValueError):
-        raise SourceError(f"{path}: no SLAMBench .raw file; give one written by scene2raw") from None
+        raise SourceError(f"{path}: not a SLAMBench .raw file; give one written by scene2raw") from None
     if not 0 < width * height <= MAX_PIXELS or second != struct.pack("<2I", width, height):
-        raise SourceError(f"{path}: no SLAMBench .raw file; give one written by scene2raw")
+        raise SourceError(f"{path}: not a SLAMBench .raw file; give one written by scene2raw")
     return (width, height), end // step, end % step == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images with a file or folder of poses next to them, as most programs export recordings."""
+"""Depth images with a file or folder of poses next to them, the usual export of recordings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
 
 
 class DepthPart(Part):
-    """Depth images, which count only where the first is one: pictures have the same endings."""
+    """Depth images, which count only if the first is one: pictures have the same endings."""
 
     def count(self, folder: str | os.PathLike[str]) -> int:
         """Return how many depth images there are."""
@@ -48,9 +48,10 @@ class DepthAndPoses(DepthFolder):
     """Depth images in a folder `depth/` (or the like, or next to the poses) and one file or folder of poses.
 
     Poses: see `pose_files` for the forms; those over time need images whose names are times, all others are one for
-    each image, in order of the numbers in the names. World: that of the poses.
-    Unit: millimetres by convention, else what the poses show (see `depth_unit`). Camera: see `find_camera`; there is no
-    default. Ground robots, hand-held scanners, simulators: what the poses and the camera are is for the user to check.
+    each image, in order of the numbers in the names. World: the poses'.
+    Unit: millimetres by convention, else found from the poses (see `depth_unit`). Camera: see `find_camera`; there is
+    no
+    default. Ground robots, hand-held scanners, simulators: the user must check the poses and the camera.
     """
 
     layout = "depth images with a file of poses (depth/ with poses.txt, trajectory.log or traj.txt)"
@@ -62,7 +63,7 @@ class DepthAndPoses(DepthFolder):
         return images_in(folder, pattern, self.fps)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures of a folder next to that of the images, if they are as large."""
+        """Return the pictures of a folder next to the images, if they are of the same size."""
         place = self._images[0].path.parent
         found = (photos_in(place.parent / name, self.fps) for name in FOLDERS if place != self.folder)
         photos = next(filter(None, found), [])
@@ -70,7 +71,7 @@ class DepthAndPoses(DepthFolder):
         return photos if photos and photo_size(photos[0].path) == size else []
 
     def read_poses(self) -> Poses | ImagePoses | None:
-        """Return the poses next to the images: of the first file or folder that holds as many as there are images."""
+        """Return the poses next to the images: the first file or folder with as many as there are images."""
         found, error = [], None
         for path in self.pose_places():
             try:
@@ -83,11 +84,12 @@ class DepthAndPoses(DepthFolder):
         if not found:
             raise error or NoPoses(f"{self.folder}: has depth images but no poses; {POSES.cure}")
         if len(self.pose_places()) > 1:
-            self.notes += (f"poses are those of {found[0].where}; else add ?poses=FILE",)
+            self.notes += (f"using poses of {found[0].where}; else add ?poses=FILE",)
         return found[0]
 
     def pose_places(self) -> list[Path]:
-        """Return the files and folders that may hold the poses, the likely first; the folder itself: one file each."""
+        """Return files and folders that may hold the poses, the likeliest first; the folder itself: one file per
+        image."""
         places = [path for pattern in POSES.patterns for path in sorted(self.folder.glob(pattern))]
         single = [path for path in places if path.parent == self.folder and re.fullmatch(POSE_FILE, path.name)]
         if len(single) > 1:
@@ -101,14 +103,14 @@ class DepthAndPoses(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with depth images and poses, or says where its poses are."""
+        """Return whether `where` is a folder with depth images and poses, or names its poses."""
         folder = folder_part(where)
         posed = "poses=" in where[len(folder) :] or POSES.count(folder) > 0
         return posed and has_depth(folder)
 
     @classmethod
     def depth_only(cls, where: str) -> DepthOnly:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return DepthOnly(where)
 
 
@@ -137,7 +139,7 @@ def has_depth(folder: str) -> bool:
 
 
 def image_place(folder: Path) -> tuple[Path, str]:
-    """Return the folder that holds the depth images, and a regular expression of their names."""
+    """Return the folder with the depth images, and a regular expression of their names."""
     for pattern in DEPTH.patterns:
         found = next(iter(sorted(folder.glob(pattern))), None)
         if found is not None:

@@ -13,7 +13,7 @@
 | NumPy | `.npy` of (N, 4, 4), (N, 16), (N, 12) or (N, 7) numbers | scripts |
 | a folder | a file for each image, with 16 or 12 numbers or `tx ty tz qx qy qz qw` | ScanNet, 7-Scenes |
 
-All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) say otherwise.
+All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) differ.
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ from stereovox.sources.poses.trajectory import Trajectory
 
 FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
 MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
-"""What turns left-handed poses into right-handed ones, see `in_other_hand`."""
+"""Turn left-handed poses into right-handed ones, see `in_other_hand`."""
 SECOND = 1_000_000_000
 MAX_NUMBER = 10_000_000
-"""Whole stamps in seconds below this may be numbers of images; times since 1970 are larger."""
+"""Whole stamps in seconds below this may be image numbers; times since 1970 are larger."""
 
 
 class ImagePoses:
     """Poses of a camera, one for each image, in order.
 
     Args:
-        T_world_camera: For each image (4, 4) in metres, or what is wrong with it in one line, or None without a pose.
-        where: What they came from, for messages.
-        numbers: The number of the image that each is of; None if they only have an order.
+            T_world_camera: For each image (4, 4) in metres, or its fault in one line, or None without a pose.
+            where: Origin of the poses, for messages.
+            numbers: The image number of each pose; None if they only have an order.
 
-    Raises:
-        SourceError: Not one image has a pose.
+        Raises:
+            SourceError: No image has a pose.
     """
 
     def __init__(self, T_world_camera: Sequence[Transform | str | None], where: str, numbers: list[int] | None = None):
         if all(T is None or isinstance(T, str) for T in T_world_camera):
             why = T_world_camera[0] if T_world_camera else "it is empty"
-            raise SourceError(f"{where}: holds no pose that can be used ({why}); write {FORMS}")
+            raise SourceError(f"{where}: holds no usable pose ({why}); write {FORMS}")
         self._poses = list(T_world_camera)
         self.where, self.numbers = where, numbers
 
@@ -73,7 +73,7 @@ class ImagePoses:
         return found.copy()
 
     def of(self, numbers: Sequence[int]) -> ImagePoses:
-        """Return the poses of images with these numbers, by the poses' own numbers; raises SourceError for no pose."""
+        """Return the poses of images with these numbers, by the poses' own numbers; raises SourceError without any."""
         known = dict(zip(self.numbers or range(len(self)), self._poses, strict=True))
         return ImagePoses([known.get(number) for number in numbers], self.where)
 
@@ -88,7 +88,7 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         `Poses` over time for the TUM form, else `ImagePoses`.
 
     Raises:
-        SourceError: It cannot be read, is of no known form, or holds no usable pose.
+        SourceError: It is unreadable, of an unknown form, or has no usable pose.
     """
     if os.path.isdir(path):
         return read_pose_folder(path)
@@ -107,7 +107,7 @@ def read_poses(path: Path) -> Poses | ImagePoses:
     if widths == {4} and len(rows) % 3 == 0:
         return _stacked(path, [rows[k : k + 3] for k in range(0, len(rows), 3)])
     many = ", ".join(map(str, sorted(widths)[:5])) or "no"
-    raise SourceError(f"{path}: its lines have {many} numbers, which is no form of poses; write {FORMS}")
+    raise SourceError(f"{path}: its lines have {many} numbers, which fits no form of poses; write {FORMS}")
 
 
 def read_pose(path: Path) -> Transform:
@@ -127,7 +127,7 @@ def read_pose(path: Path) -> Transform:
 
 
 def in_optical_axes(T: Transform, axes: str, inverted: bool) -> Transform:
-    """Return T_world_camera (4, 4) in optical axes of the pose of a camera in `axes`; the world stays as it is.
+    """Return T_world_camera (4, 4) in optical axes from the pose of a camera in `axes`; the world stays the same.
 
     inverted: `T` is T_camera_world. axes: a key of `AXES`.
     """
@@ -137,20 +137,20 @@ def in_optical_axes(T: Transform, axes: str, inverted: bool) -> Transform:
 
 
 def in_other_hand(T: Transform) -> Transform:
-    """Return the pose (4, 4) of a camera whose second axis points up, a left-handed frame, as a rigid one of optical
-    axes. The image is right as it is, so the world is mirrored, along its third axis.
+    """Return the pose (4, 4) of a camera whose second axis points up, a left-handed frame, as a rigid one in optical
+    axes. The image itself is right, so the world is mirrored along its third axis.
     """
     return MIRROR_WORLD @ T @ MIRROR_CAMERA
 
 
 def number_in(name: str) -> tuple[int, str]:
-    """Return the last number in the name of a file, by which files are put in order, and the name; -1 if none is."""
+    """Return the last number in a file name, by which files are ordered, and the name; -1 if there is none."""
     found = re.findall(r"\d+", name.rpartition(".")[0] or name)
     return (int(found[-1]) if found else -1), name
 
 
 def image_numbers(poses: Poses | ImagePoses) -> list[int] | None:
-    """Return the numbers of the images that poses are of, None if they have none.
+    """Return the image numbers of poses, None if they have none.
 
     Stamps of whole seconds that are too small for a date are numbers (ICL-NUIM).
     """
@@ -164,17 +164,17 @@ def image_numbers(poses: Poses | ImagePoses) -> list[int] | None:
 
 def in_order(poses: Poses) -> ImagePoses:
     """Return poses over time as poses of images, in order of their times."""
-    faults = [None if np.isfinite(T).all() else f"{poses.where}: a pose cannot be used" for T in poses.T_world_body]
+    faults = [None if np.isfinite(T).all() else f"{poses.where}: a pose is unusable" for T in poses.T_world_body]
     found = [T if fault is None else fault for T, fault in zip(poses.T_world_body, faults, strict=True)]
     return ImagePoses(found, poses.where, image_numbers(poses))
 
 
 def read_pose_folder(path: Path, pattern: str = r".*\.(txt|pose)") -> ImagePoses:
-    """Read a folder with a file for each pose whose name matches a regular expression; raises SourceError."""
+    """Read a folder with one file per pose, named by a regular expression; raises SourceError."""
     try:
         names = [name for name in os.listdir(path) if re.fullmatch(pattern, name, re.IGNORECASE)]
     except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; give a folder you may read") from None
+        raise SourceError(f"{path}: {error.strerror}; give a readable folder") from None
     if not names:
         raise SourceError(f"{path}: holds no .txt with a pose; write one file with a 4x4 matrix for each image")
     found: list[Transform | str | None] = []
@@ -195,7 +195,7 @@ def _of_json(path: Path) -> ImagePoses:
     cameras = table.get("parameters") if isinstance(table, dict) else None
     matrices = [_extrinsic(camera) for camera in cameras] if isinstance(cameras, list) else []
     if not matrices or not all(matrices):
-        raise SourceError(f"{path}: no PinholeCameraTrajectory with an extrinsic for each image; write {FORMS}")
+        raise SourceError(f"{path}: not a PinholeCameraTrajectory with an extrinsic for each image; write {FORMS}")
     return ImagePoses([_inverted(np.reshape(matrix, (4, 4)).T, str(path)) for matrix in matrices], str(path))
 
 
@@ -216,9 +216,9 @@ def _of_numpy(path: Path) -> ImagePoses:
         with np.errstate(all="ignore"):  # a damaged shape
             numbers = np.load(io.BytesIO(read_bounded(path, MAX_LIST)), allow_pickle=False)
         rows = np.asarray(numbers, float).reshape(len(numbers), -1)
-    except Exception as error:  # what a damaged file can raise in NumPy is not bounded
+    except Exception as error:  # a damaged file can raise anything in NumPy
         why = " ".join(str(error).split())[:100]
-        raise SourceError(f"{path}: no array of poses ({why}); save one of (N, 4, 4) numbers") from None
+        raise SourceError(f"{path}: not an array of poses ({why}); save one of (N, 4, 4) numbers") from None
     return ImagePoses([_matrix(row, f"{path}, pose {n}") for n, row in enumerate(rows.tolist())], str(path))
 
 
@@ -248,7 +248,7 @@ def _stacked(path: Path, blocks: list[list[list[float]]]) -> ImagePoses:
 
 
 def _matrix(numbers: Sequence[float], where: str) -> Transform | str:
-    """Return the pose in 16, 12 or 7 numbers, or what is wrong with their form; the gate judges the rest."""
+    """Return the pose in 16, 12 or 7 numbers, or the fault of their form; the gate checks the rest."""
     if len(numbers) == 7:
         if not any(numbers[3:]):
             return f"{where}: a quaternion of length zero; correct it"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether poses belong to the images they come with: found by how well images agree with each other at their poses.
+"""Checks whether poses belong to their images, by how well images agree with each other at their poses.
 
-Poses that are inverted, of a camera with other axes, or not in metres put every surface somewhere else from image to
-image. Where the images agree under another reading of the same poses, that reading is right.
+Poses that are inverted, of a camera with other axes, or not in metres put each surface in another place from image to
+image. If the images agree under another reading of the same poses, that reading is right.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from stereovox.sources.rgbd.pose_files import in_optical_axes, in_other_hand
 POSE_SCALES = (1.0, 0.001, 0.01)
 """Metres per unit of poses that are tried."""
 AGREES = 0.03
-"""Relative difference of depths that are of the same surface."""
+"""Largest relative difference of depths on the same surface."""
 FAR_OFF, FEW, SEEN_TWICE = 0.06, 0.25, 0.1
-"""Poses do not fit where the median relative difference of depths is larger, a smaller share of the points agrees, and
-at least this share is seen by both images, so that it means something."""
+"""Poses do not fit if the median relative difference of depths is larger, a smaller share of the points agrees, and
+at least this share is visible in both images, so that the result is significant."""
 BETTER, CLOSER, ENOUGH = 1.5, 2.0, 0.2
-"""Times as many points that must agree under another reading of the poses, times as small the median difference must
-be, and the least share of all points that must agree."""
+"""Factor by which more points must agree under another reading of the poses, factor by which the median difference must
+be smaller, and the smallest share of all points that must agree."""
 MIN_PAIRS = 2
-"""Pairs of images that must speak for another reading."""
+"""Pairs of images needed to support another reading."""
 SURELY = 0.4
-"""Share of the points that agree under a reading that needs no other unit."""
+"""Share of the points that must agree before no other unit is tried."""
 SAME = 0.5
-"""Share of the points that stay where they are in images of a camera that does not move."""
+"""Share of the points that stay in place in images of a static camera."""
 
 
 class Reading(NamedTuple):
-    """How poses are read.
+    """Interpretation of poses.
 
     axes: a key of `AXES`. invert: whether they are world to camera. poses_scale: metres per unit of their positions.
     """
@@ -50,7 +50,7 @@ class Reading(NamedTuple):
     poses_scale: float = 1.0
 
     def pose(self, T: Transform) -> Transform:
-        """Return T_world_camera (4, 4) in metres and optical axes of a pose (4, 4) as it is in a file."""
+        """Return T_world_camera (4, 4) in metres and optical axes from a pose (4, 4) as in a file."""
         if self == Reading():
             return T
         scaled = T.copy()
@@ -58,7 +58,7 @@ class Reading(NamedTuple):
         return in_optical_axes(scaled, self.axes, self.invert)
 
     def options(self, other: Reading) -> str:
-        """Return the options behind a folder's name that lead from this reading to another."""
+        """Return the options behind a folder's name that change this reading into another."""
         changes = {"invert": "01"[other.invert], "axes": other.axes, "poses_scale": f"{other.poses_scale:g}"}
         return "&".join(f"{key}={text}" for key, text in changes.items() if getattr(self, key) != getattr(other, key))
 
@@ -66,7 +66,7 @@ class Reading(NamedTuple):
 class Images(NamedTuple):
     """The images of a recording.
 
-    number: how many there are. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
+    number: their number. pose: pose (4, 4) by number as in the file; read: image by number; both may raise
     FrameRefused. camera: the camera of all.
     """
 
@@ -80,15 +80,15 @@ class Images(NamedTuple):
         return pairs_of(self.number, lambda i: reading.pose(self.pose(i)), self.read)
 
     def mirrored(self) -> Images:
-        """Return the same with poses of a camera whose y points up, in a left-handed world (or the other way round)."""
+        """Return the same with poses of a camera whose y points up, in a left-handed world (or the reverse)."""
         return self._replace(pose=lambda i: in_other_hand(self.pose(i)))
 
 
 class Agreement(NamedTuple):
-    """How images agree with each other.
+    """Agreement of images with each other.
 
-    share: of all points, those that the other image shows where they must be. median: of the relative differences of
-    depths, infinity without any. seen: share of the points that both images show.
+    share: of all points, those with the expected depth in the other image. median: of the relative differences of
+    depths, infinity without any. seen: share of the points visible in both images.
     """
 
     share: float
@@ -97,16 +97,16 @@ class Agreement(NamedTuple):
 
 
 def misfit(images: Images, unit: float, expected: float, now: Reading) -> str:
-    """Say that poses do not fit the images, and how to read them so that they do.
+    """Report that poses do not fit the images, and how to read them so that they do.
 
     Args:
         images: The images and their poses.
-        unit: Metres per unit of the images, as it was found.
+        unit: Metres per unit of the images, as found.
         expected: The same by convention.
-        now: How the poses are read.
+        now: The current reading of the poses.
 
     Returns:
-        What is wrong and what to try, in words; empty if nothing speaks against the poses.
+        The problem and a suggestion, in words; "" if the poses are plausible.
     """
     pairs = images.pairs(now)
     if not pairs:
@@ -133,7 +133,7 @@ def misfit(images: Images, unit: float, expected: float, now: Reading) -> str:
 
 
 def agreement(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: float) -> Agreement:
-    """Return how images of pairs agree with each other where their unit is `unit` metres."""
+    """Return how well images of pairs agree if their unit is `unit` metres."""
     found, points = [np.empty(0)], 0
     for first, second in pairs:
         T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
@@ -146,9 +146,9 @@ def agreement(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: f
 
 
 def _better(images: Images, expected: float, now: Reading) -> tuple[Reading, float, Agreement] | None:
-    """Return the other reading of the poses, and unit of the images, under which these agree best; None without any.
+    """Return the other reading of the poses, and unit of the images, that agree best; None without any.
 
-    Another unit than the `expected` one is tried where that fits hardly, and counts where the images confirm it.
+    Units other than `expected` are tried if that fits poorly, and accepted if the images confirm them.
     """
     readings = [Reading(*names) for names in product(AXES, (False, True), POSE_SCALES)]
     found = [(reading, expected, images.pairs(reading)) for reading in readings if reading != now]
@@ -174,7 +174,7 @@ def _best(
 
 
 def _standing(images: Images, unit: float, now: Reading) -> str:
-    """Say that poses stand still while the images change; empty if they do not."""
+    """Report that poses stand still while the images change; "" otherwise."""
     last = images.number - 1
     try:
         first, *others = [View(images.read(i), now.pose(images.pose(i))) for i in sorted({0, last // 2, last})]
@@ -185,6 +185,6 @@ def _standing(images: Images, unit: float, now: Reading) -> str:
     if not others or not all(alike) or not found.seen or found.share > SAME * found.seen:
         return ""
     return (
-        f"poses are all alike, but the images change: only {100 * found.share / found.seen:.0f} % of the points stay "
-        "where they are; give the poses of a moving camera"
+        f"poses are all equal, but the images change: only {100 * found.share / found.seen:.0f} % of the points stay "
+        "in place; give the poses of a moving camera"
     )

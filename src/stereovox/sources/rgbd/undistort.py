@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images of a camera whose lens distorts, turned into those of a pinhole camera."""
+"""Conversion of depth images of a distorting lens into those of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from stereovox.cameras.pinhole import PinholeCamera
 Image = TypeVar("Image", bound=NDArray[Any])
 
 NEGLIGIBLE_PX = 0.5
-"""Distortion that moves no pixel farther is left as it is."""
+"""Distortion of at most this is ignored."""
 
 
 class Undistortion:
-    """Moves the pixels of depth images to where a pinhole camera of the same numbers sees them.
+    """Moves the pixels of depth images to their positions in a pinhole camera with the same intrinsics.
 
-    Each pixel gets the value of the nearest one of the distorted image, as depth must not be averaged across edges.
+    Each pixel takes the value of the nearest pixel of the distorted image, since depth must not be averaged across
+    edges.
 
     Args:
         camera: The pinhole camera.
         coefficients: k1, k2, p1, p2, k3 and so on, in OpenCV's order.
 
     Attributes:
-        moved_px: Longest way that a pixel moves; 0 where it is negligible, and then nothing is changed.
+        moved_px: Largest displacement of a pixel; 0 if it is negligible, and then nothing is changed.
     """
 
     def __init__(self, camera: PinholeCamera, coefficients: Sequence[float]):
@@ -46,7 +47,7 @@ class Undistortion:
             self._maps, self.moved_px = (columns, rows), moved
 
     def __call__(self, image: Image) -> Image:
-        """Return the undistorted image (height, width), 0 where the distorted one showed nothing."""
+        """Return the undistorted image (height, width), 0 outside the distorted one."""
         if self._maps is None:
             return image
         import cv2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth camera and a tracking camera that move together (Chien 2020: D435 and T265), each with a clock of its own."""
+"""A depth camera and a tracking camera that move together (Chien 2020: D435 and T265), each with its own clock."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from stereovox.sources.rigs.pair_file import FILE, PairSettings, read_pair
 NEAR_JUMP_NS = 100_000_000
 """Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
 MAX_ATTEMPTS = 5
-"""Images tried at each end of the recording for a sound stamp."""
+"""Images tried at each end of the recording for a valid stamp."""
 CALIBRATE = "stereovox calibrate pair"
 OpenDepth = Callable[[Path, PairSettings], DepthSource]
-"""Opens the depth images that the settings of a pair's folder name; see `opening.open_depth`."""
+"""Opens the depth images named in a pair's settings; see `opening.open_depth`."""
 
 
 class CameraPair(DepthSource):
     """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker next to them.
 
-    The depth images can be any other recording, so the class is given the function that opens them.
+    The depth images can be any other recording, so the class receives the function that opens them.
 
     Pose of an image: the tracker's, interpolated at the image's time on the depth camera's clock, times
-    T_tracker_camera. World: as `world` says; gravity is left to the tracker.
-    Faults besides those of the depth source: `no_pose` and `bad_pose_file` (see `Poses.at`), `low_confidence` (a pose
+    T_tracker_camera. World: set by `world`; gravity is left to the tracker.
+    Faults in addition to the depth source's: `no_pose` and `bad_pose_file` (see `Poses.at`), `low_confidence` (a pose
     next to the image's time is below `min_confidence`), `pose_jump` (the image was taken within 0.1 s of a jump).
-    After a jump the tracker's new poses are used unchanged: a T265 jumps when it recognises a place, and is then nearer
-    to where it was when it first mapped that place. What was mapped just before the jump stays where it is.
+    After a jump the tracker's new poses are used unchanged: a T265 jumps when it recognises a place, and is then closer
+    to its first visit there. The map of the time just before the jump is not corrected.
 
     Args:
         where: The folder.
-        open_depth: Opens the depth images that the settings name; usually `opening.open_depth`.
+        open_depth: Opens the depth images named in the settings; usually `opening.open_depth`.
 
     Raises:
         SourceError: A bad `pair.toml`, no T_tracker_camera, depth images or poses that cannot be opened, or clocks
@@ -80,7 +80,7 @@ class CameraPair(DepthSource):
         return len(self._depth)
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i` of the depth camera with the tracker's pose, or with the `fault` that forbids it."""
+        """Return frame `i` of the depth camera with the tracker's pose, or with a `fault`."""
         frame = self._depth.frame(i)
         if frame.fault:
             return frame
@@ -95,7 +95,7 @@ class CameraPair(DepthSource):
         poses = self._poses
         T_world_tracker = poses.at(stamp_ns)
         around = list(poses.neighbours(stamp_ns))
-        if poses.confidence is not None and not poses.confidence[around].min() >= self._min_confidence:  # NaN as well
+        if poses.confidence is not None and not poses.confidence[around].min() >= self._min_confidence:  # also NaN
             found = f"confidence is {poses.confidence[around].min():g} at {seconds_from_ns(stamp_ns)} s"
             raise FrameRefused(
                 "low_confidence", f"{poses.where}: {found}, below min_confidence {self._min_confidence:g}"
@@ -115,7 +115,7 @@ class CameraPair(DepthSource):
             )
 
     def _jump_steps(self) -> NDArray[np.float64]:
-        """Return how far (K,) metres the pose moves in each jump."""
+        """Return the distance (K,) in metres that the pose moves in each jump."""
         before, after = np.moveaxis(self._poses.T_world_body[self._jumps, :3, 3], 1, 0)
         return np.linalg.norm(after - before, axis=1)
 
@@ -124,7 +124,7 @@ class CameraPair(DepthSource):
             return ()
         largest = self._jump_steps().max()
         count = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
-        consequence = "images near are left out, later ones count as they are"
+        consequence = "images near jumps are left out, later ones are used unchanged"
         return (f"{self._poses.where}: {count} of up to {largest:.2f} m; {consequence}",)
 
 
@@ -143,7 +143,7 @@ def open_poses(folder: Path, settings: PairSettings) -> Poses:
 def image_times(depth: DepthSource) -> tuple[int, int]:
     """Return the times in nanoseconds of the first and of the last image.
 
-    A damaged message of a recording has only its recording time, perhaps by another clock: the stamp of an intact one
+    A damaged message of a recording has only its recording time, perhaps of another clock: the stamp of an intact one
     among the first or last few is preferred.
     """
     few = range(min(MAX_ATTEMPTS, len(depth)))
@@ -170,7 +170,7 @@ def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
 
 
 class CorrectedDepth(DepthSource):
-    """A depth source with the unit or baseline of `pair.toml` in place of its own."""
+    """A depth source with the unit or baseline of `pair.toml` instead of its own."""
 
     def __init__(self, source: DepthSource, settings: PairSettings):
         self._source, self._scale = source, settings.depth_scale

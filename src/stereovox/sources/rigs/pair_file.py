@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`pair.toml`: which depth images and which tracker belong together, and how their frames and clocks are related."""
+"""`pair.toml`: the depth images and the tracker of a pair, and the relation of their frames and clocks."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from stereovox.sources.poses.tracker import AXES, HIGHEST_CONFIDENCE, WORLDS
 
 FILE = "pair.toml"
 TOLERANCE = 0.005
-"""Largest entry of abs(R^T R - I) that passes for rounding."""
+"""Largest entry of abs(R^T R - I) that counts as rounding."""
 RATES = (0.9, 1.1)
 
 
 @dataclass(frozen=True, eq=False)
 class PairSettings:
-    """What a `pair.toml` says; every key has a default but `T_tracker_camera`, which must be measured.
+    """The settings in a `pair.toml`; every key has a default except `T_tracker_camera`, which must be measured.
 
-    depth: folder or file of the depth images, from the file's own folder on.
+    depth: folder or file of the depth images, relative to the file's own folder.
     poses: text file of the tracker, lines `stamp tx ty tz qx qy qz qw [confidence]`, or a bag with poses.
     axes: axes of the poses in that file, `opengl` (T265), `optical` or `ros`; world: axes of the map, `up` (z up),
         `optical` (Chien 2020) or `file` (see `tracker.py`).
     T_tracker_camera: (4, 4) metres; maps the depth camera's optical frame into the tracker's body frame, both in
-        optical axes (x right, y down, z forward), whatever `axes` says; None: not known yet.
+        optical axes (x right, y down, z forward), whatever `axes` is; None: unknown.
     clock_offset_s, clock_rate: depth stamp = tracker stamp + offset + (rate - 1) * (tracker stamp - the first one).
-    min_confidence: poses below it are not used (where the file tells a confidence).
+    min_confidence: poses below it are not used (if the file has a confidence).
     max_speed_mps, max_turn_dps: poses further apart than this speed allows are a jump.
-    depth_scale: metres per unit of the images, baseline: metres; None: what the depth source says.
+    depth_scale: metres per unit of the images, baseline: metres; None: the depth source's.
     """
 
     depth: str = "."
@@ -95,7 +95,7 @@ def _value(key: str, value: Any) -> Any:
             raise ValueError(f"{key} = {shown(value)} must be a number from {low:g} to {high:g}")
         return float(value)
     if not isinstance(value, str) or not value or "\0" in value:
-        raise ValueError(f"{key} = {shown(value)} must be a text")
+        raise ValueError(f"{key} = {shown(value)} must be a string")
     if value not in WORDS.get(key, (value,)):
         raise ValueError(f"{key} = '{value}' is unknown{did_you_mean(value, WORDS[key])}")
     return value

@@ -28,7 +28,7 @@ from stereovox.sources.rigs.rig_file import FILE, Rig, RigPair, read_rig
 from stereovox.sources.rigs.rig_options import POSES, as_body, folder_and_options, poses_of_images
 
 SHORTEST_NS = 1_000_000
-"""Image names of a pair that span less are numbers, not times."""
+"""Image names of a pair that span less than this are numbers, not times."""
 
 
 class Shot(NamedTuple):
@@ -44,19 +44,19 @@ class RigSource(Source, ABC):
     """Frames of stereo pairs whose images are files, with the poses of the vehicle over time.
 
     A layout calls `_set` in its constructor.
-    Frames: a `StereoFrame` for each shot. Pose: between the neighbours before and after the image's time, times
-    T_body_camera; both must be less than 0.1 s away. World: that of the poses. Each pair is a sensor of its own, by its
+    Frames: a `StereoFrame` for each shot. Pose: interpolated between the neighbours of the image's time, times
+    T_body_camera; both must be less than 0.1 s away. World: the poses'. Each pair is a sensor of its own, by its
     name. Faults: those of `read_picture_png` and of `Poses.at`.
     """
 
     pairs: list[StereoPair]
     _calibration: str
-    """The file that tells the images' sizes, for messages."""
+    """The file with the images' sizes, for messages."""
 
     def _set(
         self, rig: Rig, folder: Path, shots: Iterable[Shot], poses: Poses | UnknownPoses, calibration: str
     ) -> None:
-        """Set the pairs and their images, which are put in order of time."""
+        """Set the pairs and their images, which are sorted by time."""
         self.pairs = rig.stereo_pairs(folder)
         self.camera = self.pairs[0].camera.middle
         self._shots = sorted(shots, key=lambda shot: (shot.stamp_ns, shot.pair))
@@ -64,14 +64,14 @@ class RigSource(Source, ABC):
 
     @classmethod
     def depth_only(cls, where: str) -> Self:
-        """Return the images without looking for poses: every pose is NaN."""
-        return cls(where, posed=False)  # pyright: ignore[reportCallIssue] - each layout is made from its place
+        """Return the images without searching for poses: every pose is NaN."""
+        return cls(where, posed=False)  # pyright: ignore[reportCallIssue] - each layout is constructed from its place
 
     def __len__(self) -> int:
         return len(self._shots)
 
     def frame(self, i: int) -> StereoFrame:
-        """Return frame `i`; its images are (0, 0) and its pose NaN where it has a `fault`."""
+        """Return frame `i`; its images are (0, 0) and its pose NaN if it has a `fault`."""
         shot = self._shots[range(len(self))[i]]
         pair = self.pairs[shot.pair]
         no_image, no_pose = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
@@ -101,24 +101,24 @@ class RigSource(Source, ABC):
             if refused.reason != "bad_shape":
                 raise
         (width, height), expected = png_size(path, EYE_KINDS), f"{size[0]}x{size[1]}"
-        said = f"{path}: {width}x{height} pixels, {self._calibration} says {expected}"
+        said = f"{path}: {width}x{height} pixels, {self._calibration} has {expected}"
         raise FrameRefused("bad_shape", f"{said}; correct width and height there, or the image") from None
 
 
 class StereoRig(RigSource):
     """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
 
-    posed: without it poses are not looked for, and are NaN.
+    posed: if False, poses are not searched for, and are NaN.
     where: the folder, or with options `flight?poses=trajectory.log&fps=20`:
-        poses: a file or folder of poses of any form (see `rgbd.pose_files`) in place of the rig file's.
-        axes: the poses are those of the first pair's left eye, in `optical`, `opengl` or `ros` axes, not the body's.
-        invert: 1 where poses map the world into what is posed. fps: images a second, where their names are numbers.
-    Frames: a `StereoFrame` for each left image of each pair, in order of time; of one time in the rig file's order.
-    Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
-    Poses and faults: see `RigSource`. Why a pixel has no value is found out by matching (`depth.stereo`); the rig's
-    masks make it MASKED. Raises SourceError for a bad rig file, masks or folders that cannot be read, names that are no
+        poses: a file or folder of poses of any form (see `rgbd.pose_files`) instead of the rig file's.
+        axes: the poses are the first pair's left eye's, in `optical`, `opengl` or `ros` axes, not the body's.
+        invert: 1 if poses map the world into the posed frame. fps: images a second, if their names are numbers.
+    Frames: a `StereoFrame` for each left image of each pair, in order of time; at one time in the rig file's order.
+    Both images of a moment have the same name, their time in nanoseconds, or share a line of the pair's index.
+    Poses and faults: see `RigSource`. Reasons of invalid pixels come from matching (`depth.stereo`); the rig's
+    masks make pixels MASKED. Raises SourceError for a bad rig file, unreadable masks or folders, names that are not
     times, and if there is no image or no file of poses.
-    Names of several images that span less than a millisecond are no times.
+    Names of several images that span less than a millisecond are not times.
     """
 
     layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
@@ -169,7 +169,7 @@ def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _shots(folder: Path, number: int, pair: RigPair, fps: float) -> list[Shot]:
-    """Return the images of a pair. fps: images a second, whose names are numbers; 0: names are times."""
+    """Return the images of a pair. fps: images a second, with numbers as names; 0: names are times."""
     left, right = (folder / name for name in pair.folders())
     for side, place in (("left", left), ("right", right)):
         if not os.path.isdir(place):
@@ -208,5 +208,7 @@ def _listed(path: Path, number: int, left: Path, right: Path) -> list[Shot]:
 
 def _stamp(path: Path) -> int:
     if not (path.stem.isascii() and path.stem.isdecimal() and int(path.stem) < 2**63):
-        raise SourceError(f"{path}: its name is no time in nanoseconds; rename it, or list the images in an index file")
+        raise SourceError(
+            f"{path}: its name is not a time in nanoseconds; rename it, or list the images in an index file"
+        )
     return int(path.stem)

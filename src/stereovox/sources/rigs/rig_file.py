@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rig.toml`: any number of stereo pairs, their lenses and places on the vehicle; read, checked and written."""
+"""`rig.toml`: any number of stereo pairs, their lenses and mounts on the vehicle; read, checked and written."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mas
 WORDS = ("left", "right", "index", "mask")
 SIZES = ("width", "height")
 LARGEST = 32_767
-"""Pixels along a side; OpenCV takes no more."""
+"""Most pixels along a side; OpenCV's limit."""
 TOLERANCE = 5e-3
-"""Largest entry of abs(R^T R - I) that passes for rounding."""
+"""Largest entry of abs(R^T R - I) that counts as rounding."""
 UNWRITTEN = ("binning", "correction")
 
 
@@ -52,16 +52,16 @@ def usual_virtual(eyes: Eyes | None) -> Virtual:
 
 @dataclass(frozen=True, eq=False)
 class RigPair:
-    """One `[[pair]]` of a rig file. It has either `eyes`, whose images are to be rectified, or `camera`.
+    """One `[[pair]]` of a rig file. It has either `eyes`, whose images must be rectified, or `camera`.
 
-    name: for messages, and the folder of its images. left, right: folders of images, from the file's own folder on;
+    name: for messages, and the folder of its images. left, right: folders of images, relative to the file's own folder;
         "": `NAME/left` and `NAME/right`. index: file of lines `stamp left [right]` (seconds, file names in these
         folders); "": images are named by their time in nanoseconds.
-    camera: what the images were rectified to, with the baseline. virtual: what they are to be rectified to.
-    T_body_left: (4, 4) maps the optical frame of the left eye (as it is where there are `eyes`, rectified where there
-        are none) into the vehicle's, in which the poses are.
+    camera: the camera of already rectified images, with the baseline. virtual: the camera to rectify to.
+    T_body_left: (4, 4) maps the optical frame of the left eye (raw if there are `eyes`, else
+        rectified) into the vehicle's, which the poses refer to.
     mask_rectangles: (u0, v0, u1, v1) in pixels of the rectified left image: columns from u0 up to but not including u1
-        and rows from v0 up to v1 are not to be used. mask: a PNG of that image's size; only what is white in it may be.
+        and rows from v0 up to v1 are excluded. mask: a PNG of that image's size; only white pixels are used.
     """
 
     name: str = "stereo"
@@ -76,14 +76,14 @@ class RigPair:
     mask: str = ""
 
     def folders(self) -> tuple[str, str]:
-        """Return the folders of the left and of the right images, from the rig file's own folder on."""
+        """Return the folders of the left and of the right images, relative to the rig file's own folder."""
         return self.left or os.path.join(self.name, "left"), self.right or os.path.join(self.name, "right")
 
     def stereo_pair(self, folder: Path | str = ".") -> StereoPair:
-        """Return the pair; `folder` is where its mask is looked for.
+        """Return the pair; `folder` contains its mask.
 
-        Raises SourceError for a mask that cannot be read or has another size, a rectangle that lies outside
-        the image, and a virtual camera that cannot be.
+        Raises SourceError if the mask is unreadable or has another size, a rectangle is outside
+        the image, or the virtual camera is impossible.
         """
         try:
             pair = self._bare()
@@ -124,7 +124,8 @@ class RigPair:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What a `rig.toml` says: the pairs, and the file of poses T_world_body (TUM format), from its own folder on."""
+    """The contents of a `rig.toml`: the pairs, and the file of poses T_world_body (TUM format), relative to its
+    folder."""
 
     pairs: tuple[RigPair, ...]
     poses: str = "poses.txt"
@@ -135,7 +136,7 @@ class Rig:
 
 
 def read_rig(path: Path | str) -> Rig:
-    """Return what `path` says; raises SourceError naming file, pair and key for anything wrong in it."""
+    """Return the rig in `path`; raises SourceError naming file, pair and key for anything wrong in it."""
     from stereovox.files.safe_io import read_table
 
     table = read_table(Path(path))
@@ -146,13 +147,13 @@ def read_rig(path: Path | str) -> Rig:
 
 
 def write_rig(path: Path | str, rig: Rig, remarks: Sequence[str] = ()) -> None:
-    """Write `rig` so that `read_rig` gives it back; `remarks` are comments at its top. Raises SourceError."""
+    """Write `rig` so that `read_rig` restores it; `remarks` are comments at its top. Raises SourceError."""
     with replacing(path, SourceError) as file:
         file.write(rig_text(rig, remarks).encode())
 
 
 def rig_of(table: dict[str, Any]) -> Rig:
-    """Return the rig that a rig file's table says; raises StereovoxError, one line with pair and key."""
+    """Return the rig in a rig file's table; raises StereovoxError, one line with pair and key."""
     _check_keys(table, ("poses", "pair"), "")
     tables = table.get("pair")
     if not isinstance(tables, list) or not tables or not all(isinstance(one, dict) for one in tables):
@@ -190,7 +191,7 @@ def _pair(name: str, table: dict[str, Any]) -> RigPair:
         given["mask_rectangles"] = _rectangles(table["mask_rectangles"])
     eyes = [key for key in (*EYES, "virtual") if key in table]
     if "camera" in table and eyes:
-        raise SourceError(f"has [pair.camera] and {eyes[0]}: the images are either rectified already or not; keep one")
+        raise SourceError(f"has [pair.camera] and {eyes[0]}: the images are either already rectified or not; keep one")
     if "camera" in table:
         return RigPair(name, camera=_camera(_table(table, "camera")), **given)
     for key in EYES:
@@ -269,7 +270,7 @@ def _table(table: dict[str, Any], key: str) -> dict[str, Any]:
 def _word(table: dict[str, Any], key: str) -> str:
     value = table.get(key)
     if not isinstance(value, str) or not value or "\0" in value:
-        said = f"{key} = {shown(value)} must be a text" if key in table else f"{key} is missing; give a text"
+        said = f"{key} = {shown(value)} must be a string" if key in table else f"{key} is missing; give a string"
         raise SourceError(said)
     return value
 
@@ -313,7 +314,7 @@ def _pair_lines(pair: RigPair) -> list[str]:
 
 
 def _filled(lens: Lens) -> Lens:
-    """Return the same lens with as many coefficients as `_lens` takes."""
+    """Return the same lens with a number of coefficients that `_lens` accepts."""
     count = next(count for count in COUNTS[lens.model] if count >= len(lens.distortion))
     return replace(lens, distortion=lens.distortion + (0.0,) * (count - len(lens.distortion)))
 

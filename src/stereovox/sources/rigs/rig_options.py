@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options behind the folder of a stereo recording, and poses of any form in place of its own."""
+"""Options behind the folder of a stereo recording, and poses of any form instead of its own."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rgbd.pose_files import ImagePoses, in_optical_axes, read_poses
 
 POSES: Mapping[str, Any] = {"poses": "", "axes": "", "invert": False}
-"""Options of all stereo recordings: a file or folder of poses in place of the layout's own (see `rgbd.pose_files`);
-axes of the camera they are of, `optical`, `opengl` or `ros`; whether they are world to camera."""
+"""Options of all stereo recordings: a file or folder of poses instead of the layout's own (see `rgbd.pose_files`);
+axes of the posed camera, `optical`, `opengl` or `ros`; whether they are world to camera."""
 
 
 def folder_and_options(where: str | os.PathLike[str], known: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
     """Return the folder in `FOLDER?key=value` and its options, with the defaults in `known`.
 
-    Raises SourceError for unknown or incomplete options, axes that are unknown, and an `fps` that is not positive.
+    Raises SourceError for unknown or incomplete options, unknown axes, and a non-positive `fps`.
     """
     text = os.fspath(where)
     folder = folder_part(text)
@@ -44,8 +44,9 @@ def folder_and_options(where: str | os.PathLike[str], known: Mapping[str, Any]) 
 def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
     """Return the poses in a file or folder of any form (see `rgbd.pose_files`), over time.
 
-    stamps_ns: times of the images in ascending order. Poses without times are one for each of them. So are those whose
-    times have nothing in common with theirs, where there are as many. Raises SourceError if there are not.
+    stamps_ns: times of the images in ascending order. Poses without times are assigned one to each image; so are poses
+    whose
+    times do not overlap the images', if their numbers are equal. Raises SourceError if they are not.
     """
     found, stamps = read_poses(path), sorted(set(stamps_ns))
     if isinstance(found, Poses):
@@ -65,7 +66,8 @@ def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
 
 
 def as_body(poses: Poses, T_body_left: Transform, axes: str, inverted: bool) -> Poses:
-    """Return T_world_body over time of poses of the left eye in `axes`; with no `axes` they are the body's already."""
+    """Return T_world_body over time from poses of the left eye in `axes`; without `axes` they are already the
+    body's."""
     if not axes and not inverted:
         return poses
     T_left_body = inverse(T_body_left) if axes else np.eye(4)

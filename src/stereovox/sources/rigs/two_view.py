@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rectified pairs of single moments, as the stereo benchmarks of Middlebury (2014, 2021) and ETH3D publish them."""
+"""Rectified pairs of independent scenes, as in the stereo benchmarks of Middlebury (2014, 2021) and ETH3D."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ IMAGES, CALIBRATION = ("im0.png", "im1.png"), "calib.txt"
 SECOND_NS = 1_000_000_000
 DISPARITIES: int = StereoConfig.model_fields["disparities"].default
 METRES = 2.0
-"""The baseline is in millimetres; a smaller number can only be metres."""
+"""The baseline is in millimetres; a smaller number must be in metres."""
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-SINGLE = "single scenes without poses, each in a world of its own; map one, for example --frames 0:1"
-ONE_LOOK = "one look leaves surfaces tentative; with --set map.prior=0.3 it is enough for occupied"
+SINGLE = "single scenes without poses, each in its own world; map one, for example --frames 0:1"
+ONE_LOOK = "one image leaves surfaces tentative; with --set map.prior=0.3 it is enough for occupied"
 EXAMPLE = "'cam0=[f 0 cx; 0 f cy; 0 0 1]', 'cam1=[...]' and 'baseline=' in mm"
 
 
 class TwoView(RigSource):
-    """A folder with im0.png, im1.png and calib.txt, or a folder of such folders: each is a single moment.
+    """A folder with im0.png, im1.png and calib.txt, or a folder of such folders: each is an independent scene.
 
-    where: the folder, or with options `Motorcycle?scale=0.5`: scale: size of the images in use, above 0 to 1;
-        without it the largest 1/n at which no disparity (`ndisp` + `doffs`) exceeds the default `stereo.disparities`.
+    where: the folder, or with options `Motorcycle?scale=0.5`: scale: factor on the size of the images, above 0 to 1;
+        default: the largest 1/n at which no disparity (`ndisp` + `doffs`) exceeds the default `stereo.disparities`.
     calib.txt: lines `key=value`: `cam0` and `cam1`, 3x3; `baseline` in millimetres; perhaps `width` and `height`. The
-    eyes may differ in cx (`doffs`), then the images are shifted as they are rectified. Images that are smaller or
-    larger than it says, by one factor, get its calibration times that factor, with a note.
+    eyes may differ in cx (`doffs`); rectification then shifts the images. If the images are smaller or
+    larger by one factor, the calibration is scaled by it, with a note.
     World: the left eye of each scene, upright (z up, x forward); there are no poses. Time: a second for each scene.
     Faults: see `RigSource`. Raises SourceError if a calibration is missing or bad.
     """
@@ -57,7 +57,7 @@ class TwoView(RigSource):
         self.name = self.folder.resolve().name
         scenes = _scenes(self.folder)
         if not scenes:
-            raise SourceError(f"{self.folder}: holds no {IMAGES[0]} and {IMAGES[1]}; give the folder that has both")
+            raise SourceError(f"{self.folder}: holds no {IMAGES[0]} and {IMAGES[1]}; give the folder with both")
         scale = _scale(options["scale"], str(where))
         pairs, notes = zip(*(_pair(scene, scale) for scene in scenes), strict=True)
         shots = [Shot(i * SECOND_NS, i, *(scene / name for name in IMAGES)) for i, scene in enumerate(scenes)]
@@ -69,7 +69,7 @@ class TwoView(RigSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with such a pair, or with folders that have one."""
+        """Return whether `where` is a folder with such a pair, or with folders that contain one."""
         return bool(_scenes(Path(folder_part(where))))
 
 
@@ -110,7 +110,9 @@ def _calibrated(scene: Path, values: dict[str, list[float]], scale: float | None
     path, notes = scene / CALIBRATION, []
     baseline = _one(values, "baseline")
     if baseline < METRES:
-        notes.append(f"{path}: baseline={baseline:g} is taken for metres, since the format's millimetres would be tiny")
+        notes.append(
+            f"{path}: baseline={baseline:g} is assumed to be metres, since the format's millimetres would be tiny"
+        )
     metres = baseline if baseline < METRES else baseline / 1000
     size, factor = _size(scene, values)
     if factor != 1:
@@ -135,19 +137,19 @@ def _calibrated(scene: Path, values: dict[str, list[float]], scale: float | None
 
 
 def _size(scene: Path, values: dict[str, list[float]]) -> tuple[tuple[int, int], float]:
-    """Return width and height in pixels, and how many times those of the calibration they are."""
+    """Return width and height in pixels, and their factor relative to the calibration."""
     told = (_one(values, "width", 0.0), _one(values, "height", 0.0))
     try:
         size = png_size(scene / IMAGES[0], EYE_KINDS)
     except FrameRefused as refused:
         if min(told) < 1:
             raise SourceError(str(refused)) from None
-        return (int(told[0]), int(told[1])), 1.0  # said when the frame is read
+        return (int(told[0]), int(told[1])), 1.0  # reported when the frame is read
     if min(told) < 1:
         return size, 1.0
     factor = size[0] / told[0]
     if abs(told[1] * factor - size[1]) > 1.5:
-        return (int(told[0]), int(told[1])), 1.0  # said when the frame is read
+        return (int(told[0]), int(told[1])), 1.0  # reported when the frame is read
     return size, factor
 
 

@@ -28,23 +28,23 @@ from stereovox.sources.robots.frames import FrameOptions, RobotFrames
 
 NO_POSE = np.full((4, 4), np.nan)
 T_BODY_OPTICAL = np.eye(4)
-"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
+"""An optical frame (z forward) in a body that faces the same direction (x forward, z up)."""
 T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
 
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """What may stand behind the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
+    """Options behind the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
 
     scan, depth, info, odom, truth: topics of scans (or point clouds), depth images, their CameraInfo, odometry
-        (nav_msgs/Odometry, in place of tf) and true poses of the robot, if they are not found or not the right ones.
+        (nav_msgs/Odometry, instead of tf) and true poses of the robot, if they are not found or the wrong ones are.
     base_frame, odom_frame: frames of the robot and of its odometry.
-    mount, camera_mount: where lidar and camera sit on the robot, in place of tf: x,y,z in metres, then yaw, pitch and
-        roll in radians, of which the last may be left out. A camera without turn looks forward.
-    axes: `ros` where depth images name the camera's body (x forward) as their frame, not its optical frame.
-    scale: metres per unit of depth (0: as the file says). range_max: metres, in place of what the scans say.
+    mount, camera_mount: mounts of lidar and camera on the robot, instead of tf: x,y,z in metres, then yaw, pitch and
+        roll in radians, of which the last may be left out. A camera without rotation points forward.
+    axes: `ros` if depth images name the camera's body (x forward) as their frame, not its optical frame.
+    scale: metres per unit of depth (0: the file's). range_max: metres, instead of the scans' own.
     max_gap, extrapolate: seconds, see `tf.Limits`.
-    lowest, highest: metres over the floor between which points of a cloud count.
+    lowest, highest: metres above the floor between which points of a cloud count.
     """
 
     scan: str = ""
@@ -96,15 +96,15 @@ def mounted(key: str, text: str) -> Transform | None:
 class RobotBag:
     """A ground robot's scans, depth images and odometry in a bag of ROS 1 (`.bag`) or ROS 2.
 
-    Topics are found by their types; where there are several the one with most messages counts, and a note names the
-    others. Scans are those of a lidar (LaserScan), without one what a lidar would see of point clouds.
+    Topics are found by their types; if there are several, the one with the most messages is used, and a note names the
+    others. Scans come from a lidar (LaserScan), or else are computed from point clouds.
 
-    World: the frame of the odometry (`odom` in tf); without it poses of a nav_msgs/Odometry topic; without that the
-    robot is taken to stand still, which SLAM can put right. A pose is looked up in tf at the time of the scan or image,
-    interpolated; gaps longer than `max_gap` are not bridged. Sensors that tf does not mount are taken for mounted at
-    the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is reported in `notes`.
+    World: the frame of the odometry (`odom` in tf); without it, poses of a nav_msgs/Odometry topic; without either, the
+    robot is assumed to stand still, which SLAM can correct. A pose is looked up in tf at the time of the scan or image,
+    interpolated; gaps longer than `max_gap` are not bridged. Sensors without a mount in tf are assumed to be
+    at the robot's own frame (`base_footprint`, else `base_link`). All assumptions are reported in `notes`.
 
-    Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
+    Invalid pixels are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
     Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
     Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
     Raises SourceError for files that are empty, damaged or without scans and depth, and for bad options.
@@ -198,7 +198,7 @@ def posed_scan(message: LaserScan, T_odom_sensor: Transform, T_base_sensor: Tran
 def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
     """Return the named depth images, or else those of the busiest topic, and notes; None if missing.
 
-    Unless they were named, unusable images (without CameraInfo) only cause a note.
+    Unless they were named, unusable images (without CameraInfo) only give a note.
     """
     if options.depth:
         return find_depth(file, options.depth, options.info), ()
@@ -208,7 +208,7 @@ def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None
     best = busiest_topic(file, found)
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
-        notes = (f"{file.path}: depth images of {best}; there are {others} too: say ?depth=/topic for those",)
+        notes = (f"{file.path}: depth images of {best}; there are {others} too: add ?depth=/topic for them",)
     try:
         return find_depth(file, best, options.info), notes
     except SourceError as error:
@@ -222,5 +222,5 @@ def _truth(file: BagFile, topic: str) -> Poses | None:
         return None
     found = topic_poses(file, topic)
     if not isinstance(found.poses, Poses):
-        raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?truth=/topic")
+        raise SourceError(f"{file.path}: {topic}: no pose can be read; name another with ?truth=/topic")
     return found.poses

@@ -29,13 +29,13 @@ TOP, GAP, SPIKE, FEWEST = 0.998, 0.75, 0.005, 20
 """Other marks of "no echo" are within 0.2 % of the largest range of a log; this share of its beams, and so many of them
 at least, are there, and not one between three quarters of that range and it."""
 MAX_DISTANCE = 1e6
-"""Metres from the world's origin within which a robot can be."""
+"""Limit in metres for the robot's distance from the world's origin."""
 MAX_BEAMS = 100_000
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
 MAX_LINE_BYTES = 1 << 20
-"""Bytes of the longest line that a log can have."""
+"""Bytes of the longest accepted line."""
 ALWAYS_ALLOWED, MAX_RATIO = 1 << 18, 100
-"""Decompressed bytes that a log may always have, and most per compressed byte; text compresses to a tenth."""
+"""Decompressed bytes that are always accepted, and most per compressed byte; text compresses to a tenth."""
 NO_ECHO_VALUES = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
 
@@ -44,7 +44,7 @@ class CarmenLog:
     """Scans (FLASER, ROBOTLASER1) of a CARMEN log, with the robot's raw odometry as poses.
 
     The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
-    are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
+    are `ipc_timestamp`, as used in `.relations` files. Invalid lines are left out, counted and
     named in `notes`. `frames` is empty, `truth` unknown.
     Raises SourceError if the file cannot be read or holds no scan.
     """
@@ -73,11 +73,11 @@ class CarmenLog:
 
 @dataclass(frozen=True)
 class Options:
-    """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
+    """Options behind the file's name, as in `aces.clf.bz2?max_range=40`.
 
-    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
-        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
-    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
+    max_range: metres from which a range means "no echo"; 0: the file's, else found from its ranges: the smaller
+        of 50 m and 81.9 m (a SICK's "no echo") that the log uses.
+    no_echo: meaning of that: `unknown`, since black and dazzling objects give no echo either, or `free` up to there.
     """
 
     max_range: float = 0.0
@@ -91,7 +91,7 @@ class Options:
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
-    """A line that makes no sense; the message says why."""
+    """An invalid line; the message is the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class Reading:
     """One scan as logged.
 
     ranges: (N,) float32 metres. pose_odom_base, pose_base_sensor: (3,) x, y, yaw. line: its number in the file.
-    max_range: metres from which on nothing was detected, 0 where the line lacks it.
+    max_range: metres from which nothing was detected, 0 if the line lacks it.
     """
 
     ranges: NDArray[np.float32]
@@ -113,17 +113,17 @@ class Reading:
 
 
 def read_laser(line: bytes, number: int, offset: float) -> Reading:
-    """Return the scan of a FLASER or ROBOTLASER1 line; `offset`: metres that the laser of FLASER lines sits forward.
+    """Return the scan of a FLASER or ROBOTLASER1 line; `offset`: metres from the robot forward to the FLASER laser.
 
     Raises DamagedLine.
     """
     words = line.split()
     try:
         return _flaser(words, number, offset) if words[0] == b"FLASER" else _robotlaser(words, number)
-    except (IndexError, ValueError, ArithmeticError) as error:  # ArithmeticError: those of Decimal
+    except (IndexError, ValueError, ArithmeticError) as error:  # ArithmeticError: raised by Decimal
         if isinstance(error, DamagedLine):
             raise
-        raise DamagedLine(f"{words[0].decode()} with words that are missing or no numbers") from None
+        raise DamagedLine(f"{words[0].decode()} with words that are missing or not numbers") from None
 
 
 def _flaser(words: list[bytes], number: int, offset: float) -> Reading:
@@ -148,11 +148,11 @@ def _robotlaser(words: list[bytes], number: int) -> Reading:
 
 
 def _numbers(words: list[bytes], at: int) -> tuple[NDArray[np.float32], list[bytes]]:
-    """Return the ranges whose number stands at `at`, and the words behind them."""
+    """Return the ranges whose count is at `at`, and the words behind them."""
     count = int(words[at])
     values, tail = words[at + 1 : at + 1 + count], words[at + 1 + count :]
     if not 0 <= count <= MAX_BEAMS or len(values) < count:
-        raise DamagedLine(f"{words[0].decode()} that tells {count} ranges and holds {len(words) - at - 1} words")
+        raise DamagedLine(f"{words[0].decode()} that declares {count} ranges and has {len(words) - at - 1} words")
     return np.array(values, dtype="S").astype(np.float64).astype(np.float32) if count else np.empty(0, np.float32), tail
 
 
@@ -171,7 +171,7 @@ def _stamp(word: bytes) -> int:
 
 
 def _angles(beams: int) -> tuple[float, float]:
-    """First angle and step of a SICK over 180 degrees, whose last beam is often left out: 181 or 180 beams."""
+    """Return first angle and step of a SICK over 180 degrees, often without its last beam: 181 or 180 beams."""
     if not beams:
         raise DamagedLine("FLASER without ranges")
     steps = beams - 1 if beams % 2 or beams < 3 else beams
@@ -232,7 +232,7 @@ def _lines(path: Path, damaged: list[str]) -> Iterator[tuple[int, bytes]]:
             while line := file.readline(MAX_LINE_BYTES):
                 number, size = number + 1, size + len(line)
                 if size > most:
-                    damaged.append(f"the packed file swells to more than {most} bytes; the rest is left out")
+                    damaged.append(f"the packed file expands to more than {most} bytes; the rest is left out")
                     return
                 yield number, line
     except EOFError:
@@ -251,8 +251,8 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
 def _no_echo(readings: list[Reading]) -> float:
     """Return the range from which on a laser means "no echo".
 
-    It is the largest range of the log if many beams have it and none lies just below it; else one of the two
-    conventions of a SICK that is a peak in the log.
+    It is the largest range of the log if many beams have it and none lies just below it; else whichever of a SICK's two
+    conventions peaks in the log.
     """
     ranges = np.concatenate([reading.ranges for reading in readings])
     ranges = ranges[np.isfinite(ranges)]

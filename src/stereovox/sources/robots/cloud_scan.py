@@ -30,10 +30,10 @@ class CloudBand:
 
 
 def scan_of_cloud(cloud: PointCloud, T_base_sensor: Transform, band: CloudBand) -> tuple[LaserScan, Transform]:
-    """Return the scan of a full turn, and T_base_scan: its frame is upright at the sensor's place.
+    """Return the scan of a full turn, and T_base_scan: its frame is upright at the sensor's position.
 
-    A beam has the distance of its nearest point in the band; +inf where that is `range_max` or more; NaN where there is
-    no point, since a cloud does not say why.
+    A beam has the distance of its nearest point in the band; +inf if that is `range_max` or more; NaN if there is
+    no point, since a cloud has no reason for it.
     """
     points = transform_points(T_base_sensor, cloud.points[np.isfinite(cloud.points).all(axis=1)])
     T_base_scan = lifted(flattened(T_base_sensor))
@@ -50,7 +50,7 @@ def scan_of_cloud(cloud: PointCloud, T_base_sensor: Transform, band: CloudBand) 
 def nearest(
     distance: NDArray[np.float64], angle: NDArray[np.float64], count: int, band: CloudBand
 ) -> NDArray[np.float32]:
-    """Return (count,) float32 ranges of beams that begin backwards (-pi), the nearest point of each."""
+    """Return (count,) float32 ranges of beams that start backwards (-pi), with the nearest point of each."""
     beams = np.rint((angle + np.pi) * count / (2 * np.pi)).astype(np.int64) % count
     ranges = np.full(count, np.inf)
     far_enough = distance >= band.range_min

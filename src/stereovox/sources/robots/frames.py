@@ -15,7 +15,7 @@ from stereovox.sources.bags.scans import first_odometry, odometry_edge, odometry
 from stereovox.sources.bags.tf import Edge, Limits, Tf, read_tf
 
 BASES = ("base_footprint", "base_link")
-"""The robot's frame is the first of these connected with its sensors: REP 120 and REP 105."""
+"""Names of the robot's frame; the first connected with its sensors is used (REP 120 and REP 105)."""
 ODOMS = ("odom", "odom_combined")
 Notes = tuple[str, ...]
 
@@ -34,7 +34,7 @@ class FrameOptions:
 class RobotFrames:
     """Poses of a robot's sensors in the world of its odometry.
 
-    sensors: frames named by the sensors, "" if there is no name; they help to choose the robot's own. tf: all
+    sensors: frames named by the sensors, "" if there is no name; they help to find the robot's own. tf: all
     transforms; empty without /tf. `mount` adds assumed ones. base, odom: frames of the robot and of its odometry; odom
     is "" if the robot is assumed to stand still. notes: assumptions made. Raises SourceError for given topics and
     frames that do not exist.
@@ -58,7 +58,7 @@ class RobotFrames:
         self.notes = (*based, *how, *self.tf.notes)
 
     def mount(self, sensor: str, alias: str, given: Transform | None, T_frame: Transform) -> tuple[str, Notes]:
-        """Return the frame in which a sensor's poses can be looked up, and notes.
+        """Return the frame for looking up a sensor's poses, and notes.
 
         given: T_base_body of the options, which takes precedence over tf. T_frame: T_body_sensor of a frame unknown to
         tf (for a camera its optical frame). alias: name of the sensor in messages.
@@ -71,11 +71,11 @@ class RobotFrames:
         known = sensor in self.tf.frames
         try:
             top = self.tf.root(sensor) if known else sensor or alias
-        except FrameRefused:  # a loop: what needs it is refused
+        except FrameRefused:  # a loop: lookups will be refused
             return sensor, ()
         self.tf.add_fixed(self.base, top, np.eye(4) if known else T_frame)
         option = "mount" if alias == "lidar" else f"{alias}_mount"
-        said = f"nothing tells where the {alias} ({top}) sits on the robot: taken for {self.base} itself"
+        said = f"the mount of the {alias} ({top}) on the robot is unknown: assumed to be {self.base} itself"
         return sensor or alias, (f"{self.path}: {said}; give ?{option}=x,y,z,yaw",)
 
     def in_base(self, sensor: str, stamp_ns: int) -> Transform:
@@ -109,25 +109,25 @@ class RobotFrames:
                 return found, ()
         if child or not self._sensors or not self._moved(self._sensors[0]):
             return child or "base_link", ()
-        said = f"no {' or '.join(BASES)} in /tf: {self._sensors[0]} is taken for the robot; else give ?base_frame="
+        said = f"no {' or '.join(BASES)} in /tf: {self._sensors[0]} is used as the robot; else give ?base_frame="
         return self._sensors[0], (f"{self.path}: {said}",)
 
     def _body(self, child: str, topic: str) -> tuple[str, Notes]:
         """Return the frame whose pose an odometry topic holds: its child frame, if that is connected with the robot."""
         if child in ("", self.base) or self.tf.connected(child, self.base):
             return child or self.base, ()
-        return self.base, (f"{self.path}: {topic} tells where {child} is: taken for {self.base}",)
+        return self.base, (f"{self.path}: {topic} has poses of {child}: assumed to be {self.base}",)
 
     def _named(self, name: str, option: str) -> str:
         """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" if there is none."""
         near = [frame for frame in self.tf.frames if frame.rpartition("/")[2] == name]
         near = [frame for frame in near if any(self.tf.connected(frame, other) for other in self._sensors)] or near
         if len(near) > 1 and name not in near:
-            raise SourceError(f"{self.path}: several robots, say which: ?{option}={f' or ?{option}='.join(near)}")
+            raise SourceError(f"{self.path}: several robots, choose one: ?{option}={f' or ?{option}='.join(near)}")
         return name if name in near else "".join(near)
 
     def _odom_in_tf(self, given: str, has_topic: bool) -> str:
-        """Return the odometry's frame where tf connects it with the robot's, else ""."""
+        """Return the odometry's frame if tf connects it with the robot's, else ""."""
         if not given:
             names = filter(None, (self._named(name, "odom_frame") for name in ODOMS))
             return next((name for name in names if self.tf.connected(name, self.base)), "")
@@ -136,7 +136,7 @@ class RobotFrames:
         if has_topic and not self.tf.frames:
             return ""
         try:
-            self.tf.moving(given, self.base)  # says what is wrong
+            self.tf.moving(given, self.base)  # raises with the reason
         except FrameRefused as refused:
             raise SourceError(f"{refused}; correct ?odom_frame={given}") from None
         return given
@@ -145,9 +145,9 @@ class RobotFrames:
         """Return the root above the robot, if it moves there; else "": it is assumed to stand still."""
         if self.base in self.tf.frames and self._moved(self.base):
             root = self.tf.root(self.base)
-            said = f"no {ODOMS[0]} in /tf: poses are those of {self.base} in {root}; else give ?odom_frame="
+            said = f"no {ODOMS[0]} in /tf: using poses of {self.base} in {root}; else give ?odom_frame="
             return root, (f"{self.path}: {said}",)
-        said = "tells no odometry: the robot is taken to stand still until its way is found (stereovox slam)"
+        said = "has no odometry: the robot is assumed to stand still until its path is found (stereovox slam)"
         return "", (f"{self.path}: {said}",)
 
     def _moved(self, frame: str) -> bool:

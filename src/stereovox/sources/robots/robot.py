@@ -12,14 +12,14 @@ from stereovox.sources.poses.poses import Poses
 
 
 class Robot(Protocol):
-    """The recording of a ground robot. Poses are those of its odometry (`T_world_sensor` = T_odom_sensor).
+    """The recording of a ground robot. Poses come from its odometry (`T_world_sensor` = T_odom_sensor).
 
     Attributes:
         name: Name of the recording.
-        notes: What had to be assumed, one line each.
+        notes: Assumptions, one line each.
         scans: Lidar scans in time order, read on access; empty without a lidar.
         frames: Depth images in time order, read on access; empty without a depth camera.
-        truth: T_world_base where it is known (simulation), else None.
+        truth: T_world_base if known (simulation), else None.
     """
 
     name: str

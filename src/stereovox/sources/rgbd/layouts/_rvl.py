@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that unpacks RVL, in which RTAB-Map packs depth images (Wilson 2017, "Fast Lossless Depth Image Compression").
+"""Kernel that unpacks RVL, RTAB-Map's compression of depth images (Wilson 2017, "Fast Lossless Depth Image
+Compression").
 
-By hand, because no dependency unpacks RVL, and this one cannot read or write past the sizes it was given.
+Written by hand, because no dependency unpacks RVL, and this one cannot read or write past the given sizes.
 """
 
 from stereovox.kernels._jit import cell, kernel
 
 MOST_GROUPS = 11
-"""Most groups of three bits that a number may have."""
+"""Most groups of three bits in a number."""
 
 
 @kernel
 def unpack(words, depth):
-    """Fill `depth` (n,) uint16 from `words` (m,) uint32; return how many pixels were written, -1 for damage.
+    """Fill `depth` (n,) uint16 from `words` (m,) uint32; return the number of pixels written, -1 if damaged.
 
-    Runs alternate: a number of zeros; a number of others, and for each of these its zigzag step from the last.
+    Runs alternate: a number of zeros; a number of other values, each as a zigzag step from the last.
     """
     group, written, last = 0, 0, 0
     while written < depth.size:
@@ -38,9 +39,9 @@ def unpack(words, depth):
 
 @cell
 def _number(words, group):
-    """Return the number that begins at a group of four bits, -1 for damage, and the group behind it.
+    """Return the number that begins at a group of four bits, -1 if damaged, and the group behind it.
 
-    Three bits a group, lowest first, behind one that says whether another follows; eight groups a word, highest first.
+    Three bits per group, lowest first, after a flag for a following group; eight groups per word, highest first.
     """
     number = 0
     for k in range(MOST_GROUPS):

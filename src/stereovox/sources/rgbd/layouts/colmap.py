@@ -26,25 +26,25 @@ from stereovox.sources.rgbd.pose_files import ImagePoses, number_in
 from stereovox.sources.rgbd.undistort import Undistortion
 
 ROOTS = ("dense", "dense/0", "")
-"""Where COLMAP's own depth maps may lie: `ROOT/stereo/depth_maps`."""
+"""Possible places of COLMAP's own depth maps: `ROOT/stereo/depth_maps`."""
 MODELS = ("sparse", "sparse/0", "", "colmap/sparse/0", "colmap/sparse", "dense/sparse", "model")
-"""Where the model may lie."""
+"""Possible places of the model."""
 DEPTHS = ("depth", "depths", "depth_images", "depth_maps")
 OWN = ("geometric", "photometric")
-"""COLMAP's own kinds of depth maps, the better first."""
+"""COLMAP's own kinds of depth maps, the better one first."""
 SAMPLES, LEAST_POINTS, AGREE = 30, 50, 0.1
-"""Images whose points are compared with depth; points that are needed; largest median relative difference of them."""
+"""Images whose points are compared with depth; required points; their largest median relative difference."""
 SAME = 0.02
-"""A model whose unit differs by less from metres is in metres."""
+"""A model whose unit differs from a metre by less is in metres."""
 
 
 class Colmap(DepthFolder):
     """A model of COLMAP (text or binary, in the folder, `sparse/`, `sparse/0/` or `dense/sparse/`) with depth images.
 
     Depth: an image in `depth/` for each of the model's, of the same name; else COLMAP's own (`stereo/depth_maps`).
-    COLMAP's poses have a unit of their own. With images of a depth camera it is found from the model's points, whose
-    depths the images show, and the map is in metres; with COLMAP's own depth the map is in COLMAP's unit. Both are
-    said in a note. World: the model's, whose axes mean nothing.
+    COLMAP's poses have their own unit. With images of a depth camera it is found from the model's points, whose
+    depths the images show, and the map is in metres; with COLMAP's own depth the map is in COLMAP's unit. A note
+    reports either. World: the model's, with arbitrary axes.
     Camera: the model's, scaled to the depth images. Distorted ones are undistorted (nearest pixel), fisheye refused.
     Images without depth are left out and counted. Times: number in order of names / 30 Hz.
     """
@@ -76,12 +76,10 @@ class Colmap(DepthFolder):
         return [ImageFile(path, int(n * SECOND / self.fps)) for n, (_, path) in enumerate(found)]
 
     def read_poses(self) -> ImagePoses:
-        """Return the poses of the images in metres, or in COLMAP's unit where depth is COLMAP's own too."""
+        """Return the poses of the images in metres, or in COLMAP's unit if depth is COLMAP's own too."""
         scale = 1.0 if self._own else self._metres_per_unit()
         if self._own:
-            self.notes += (
-                f"{self.folder}: depth and poses are in COLMAP's own unit, which is not metres; so is the map",
-            )
+            self.notes += (f"{self.folder}: depth and poses are in COLMAP's own unit, not metres; so is the map",)
         poses = []
         for image in self._posed_images:
             T = image.T_world_camera.copy()
@@ -139,7 +137,7 @@ class Colmap(DepthFolder):
         if abs(x / y - 1) > 0.02:
             raise SourceError(
                 f"{self.folder}: camera {number} is for {camera.size[0]}x{camera.size[1]} images, depth has "
-                f"{size[0]}x{size[1]}; if it is of undistorted ones, {UNDISTORT}"
+                f"{size[0]}x{size[1]}; if depth is of undistorted images, {UNDISTORT}"
             )
         try:
             return pinhole(size, scaled(camera.intrinsics, x, y), None)
@@ -147,7 +145,7 @@ class Colmap(DepthFolder):
             raise SourceError(f"{self.folder}: camera {number}: {error}") from None
 
     def _metres_per_unit(self) -> float:
-        """Return the length of the model's unit, found from its points in the depth images; 1 with a note where not."""
+        """Return the length of the model's unit, found from its points in the depth images; else 1 with a note."""
         ratios = [np.empty(0)]
         chosen = spread([image.path for image in self._images], SAMPLES)[:SAMPLES]
         by_path = {file.path: image for file, image in zip(self._images, self._posed_images, strict=True)}
@@ -155,13 +153,15 @@ class Colmap(DepthFolder):
             try:
                 ratios.append(self._ratios(by_path[path], path))
             except FrameRefused:
-                continue  # it is reported when its turn comes
+                continue  # reported when it is read
         found = np.concatenate(ratios)
         scale = float(np.median(found)) if len(found) else 1.0
         off = float(np.median(np.abs(found / scale - 1))) if len(found) else 1.0
         if len(found) < LEAST_POINTS or not off < AGREE:
             few = f"{len(found)} points are seen in depth images" if len(found) < LEAST_POINTS else "depths do not fit"
-            self.notes += (f"{self.folder}: poses are taken to be in metres; COLMAP's unit could not be found: {few}",)
+            self.notes += (
+                f"{self.folder}: poses are assumed to be in metres; COLMAP's unit could not be found: {few}",
+            )
             return 1.0
         if abs(scale - 1) < SAME:
             return 1.0
@@ -172,7 +172,7 @@ class Colmap(DepthFolder):
         return scale
 
     def _ratios(self, image: ColmapImage, path: Path) -> NDArray[np.float64]:
-        """Return metres per unit of the model by each of its points (K,) that a depth image shows."""
+        """Return metres per unit of the model from each of its points (K,) in a depth image."""
         known = [k for k, number in enumerate(image.points.tolist()) if number in self._model.points]
         if not known:
             return np.empty(0)
@@ -189,7 +189,7 @@ class Colmap(DepthFolder):
 
 
 def model_folder(folder: str | os.PathLike[str], places: Sequence[str] = MODELS) -> Path | None:
-    """Return the first of `places` in a folder that holds cameras and images of a model, None if none does."""
+    """Return the first of `places` in a folder with cameras and images of a model, None if there is none."""
     for place in places:
         for suffix in (".bin", ".txt"):
             paths = [os.path.join(folder, place, f"{name}{suffix}") for name in ("cameras", "images")]
@@ -199,7 +199,7 @@ def model_folder(folder: str | os.PathLike[str], places: Sequence[str] = MODELS)
 
 
 def _places(folder: Path) -> tuple[Path, Path | None]:
-    """Return the folder of the model, and that of COLMAP's own depth maps if there are no others."""
+    """Return the folder of the model, and the folder of COLMAP's own depth maps if there are no others."""
     others = any((folder / place).is_dir() for place in DEPTHS)
     for root in () if others else ROOTS:
         own = folder / root / "stereo/depth_maps"

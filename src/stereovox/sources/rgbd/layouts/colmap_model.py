@@ -20,11 +20,11 @@ MODELS = {
     "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
     "RAD_TAN_THIN_PRISM_FISHEYE": 16,
 }  # fmt: skip
-"""Models of cameras in the order of their numbers in binary files, and how many parameters they have."""
+"""Camera models in the order of their numbers in binary files, and their numbers of parameters."""
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 READABLE = (*ONE_FOCAL, "PINHOLE", "OPENCV", "FULL_OPENCV")
 LARGEST = 1e9
-"""Numbers of poses and pixels are smaller."""
+"""Bound of numbers in poses and pixels."""
 UNDISTORT = "undistort its images first: colmap image_undistorter"
 
 
@@ -59,16 +59,16 @@ class ColmapModel(NamedTuple):
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a model; binary files come first, as in COLMAP.
+    """Read a model; binary files take precedence, as in COLMAP.
 
     Args:
-        folder: Holds cameras, images and perhaps points3D, all `.bin` or all `.txt`.
+        folder: Contains cameras, images and perhaps points3D, all `.bin` or all `.txt`.
 
     Returns:
         The model.
 
     Raises:
-        SourceError: A file is missing, damaged, or has a camera that is no (distorted) pinhole.
+        SourceError: A file is missing or damaged, or a camera is not a (distorted) pinhole.
     """
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     read = (_cameras_bin, _images_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _images_txt, _points_txt)
@@ -100,7 +100,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], numbers: list[float])
     if not np.isfinite(numbers).all() or min(size) <= 0:
         raise ValueError(f"a camera of {size[0]}x{size[1]} pixels, or NaN or infinity")
     fx, fy, cx, cy, *rest = [numbers[0], *numbers] if model in ONE_FOCAL else numbers
-    return ColmapCamera(size, (fx, fy, cx - 0.5, cy - 0.5), tuple(rest))  # COLMAP's first pixel begins at 0
+    return ColmapCamera(size, (fx, fy, cx - 0.5, cy - 0.5), tuple(rest))  # COLMAP's first pixel starts at 0
 
 
 def _image(name: str, camera: int, seven: list[float], pixels: NDArray[np.float64], points: NDArray) -> ColmapImage:
@@ -113,7 +113,7 @@ def _image(name: str, camera: int, seven: list[float], pixels: NDArray[np.float6
 
 
 def _lines(content: bytes) -> list[str]:
-    """Return all lines that are no comments; empty ones stay, as an image without points has an empty second line."""
+    """Return all lines except comments; empty ones stay, as an image without points has an empty second line."""
     return [line for line in content.decode("utf-8", "replace").splitlines() if not line.lstrip().startswith("#")]
 
 
@@ -132,7 +132,7 @@ def _images_txt(path: Path, content: bytes) -> list[ColmapImage]:
             continue
         words = line.split(maxsplit=9)
         if len(words) != 10:
-            raise ValueError(f"'{line[:40]}' is no line of an image")
+            raise ValueError(f"'{line[:40]}' is not a line of an image")
         rows = np.array(next(lines, "").split(), float).reshape(-1, 3)
         seven = [float(word) for word in words[1:8]]
         found.append(_image(words[9], int(words[8]), seven, rows[:, :2], rows[:, 2]))

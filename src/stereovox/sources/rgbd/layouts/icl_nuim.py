@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renderings of ICL-NUIM (living room, office), as SLAMBench and TUM's tools use them.
+"""Renderings of ICL-NUIM (living room, office), in the form of SLAMBench and TUM's tools.
 
 Their camera is left-handed: x right, y up, z forward, so its fy is negative (481.2 -480 319.5 239.5), and so is their
-world. Both are mirrored here (see `in_other_hand`), so the room comes out as its images show it.
+world. Both are mirrored here (see `in_other_hand`), so the room looks as in its images.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ VECTOR = re.compile(r"(cam_pos|cam_dir|cam_up)\s*=\s*\[([^\]]*)\]")
 class IclNuim(DepthFolder):
     """`depth/0.png` (1/5000 m) with `livingRoom2.gt.freiburg`, TUM's lines whose stamps are numbers of images.
 
-    Also with `groundtruth.txt` in its place, where images and stamps are such numbers and no file says the camera.
+    Also with `groundtruth.txt` instead, if images and stamps are such numbers and there is no camera file.
     Image 0 has no pose in the data set. World: y up. Times: number / 30 Hz.
     """
 
@@ -60,7 +60,7 @@ class IclNuim(DepthFolder):
         return self.fitted(Trajectory(path))
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera; its poses are left-handed whatever its file says of fy."""
+        """Return the camera; its poses are left-handed whatever the sign of fy in its file."""
         return super().find_camera(size)._replace(mirrored=True)
 
     @classmethod
@@ -88,11 +88,11 @@ class IclNuimScene(DepthFolder):
         return images_in(self.folder, SCENE.pattern, self.fps)
 
     def size(self) -> tuple[int, int]:
-        """Return (width, height): the texts do not say it, the data set's is 640x480."""
+        """Return (width, height): the texts lack it, the data set's is 640x480."""
         return 640, 480
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera; its poses are left-handed whatever its file says of fy."""
+        """Return the camera; its poses are left-handed whatever the sign of fy in its file."""
         return super().find_camera(size)._replace(mirrored=True)
 
     def pose_in_file(self, i: int) -> Transform:
@@ -150,7 +150,7 @@ def _vector(text: str) -> NDArray[np.float64]:
 
 
 def _is_renamed(folder: Path) -> bool:
-    """Return whether images and the stamps of groundtruth.txt are small whole numbers, and no file says the camera."""
+    """Return whether images and the stamps of groundtruth.txt are small integers, and there is no camera file."""
     if any(os.path.isfile(folder / name) for name in ("camera.toml", *NAMES)):
         return False
     try:

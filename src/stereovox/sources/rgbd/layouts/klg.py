@@ -18,7 +18,7 @@ from stereovox.sources.rgbd.pose_files import ImagePoses
 HEAD = struct.Struct("<qii")
 """Time in microseconds, bytes of depth and of the picture."""
 SIZES = ((640, 480), (320, 240), (512, 424), (848, 480), (1280, 720))
-"""Usual (width, height); a file does not say its own."""
+"""Usual (width, height); a file does not contain its own."""
 INTRINSICS = 528.0, 528.0, 320.0, 240.0
 MOST_BYTES = 2 * max(width * height for width, height in SIZES)
 
@@ -27,7 +27,7 @@ class KlgLog(PackedDepth):
     """A number of frames, then for each its time, depth (uint16 mm, zlib or plain) and picture (not read).
 
     The size of the images follows from the bytes of the first. Poses: `?poses=FILE`, or the one `.freiburg` next to it,
-    as ElasticFusion writes; world: the first camera's. Camera: a file next to it, else for 640x480 ElasticFusion's
+    as written by ElasticFusion; world: the first camera's. Camera: a file next to it, else for 640x480 ElasticFusion's
     528 528 320 240, with a note.
     """
 
@@ -39,7 +39,7 @@ class KlgLog(PackedDepth):
         return [image._replace(stamp_ns=stamp) for image, stamp in zip(images, self._stamps, strict=True)]
 
     def index(self) -> list[Piece]:
-        """Return where the frames are; raises SourceError."""
+        """Return the positions of the frames; raises SourceError."""
         pieces, self._stamps, end = [], [], self.file.stat().st_size
         try:
             with self.file.open("rb") as file:
@@ -57,9 +57,9 @@ class KlgLog(PackedDepth):
                     self._stamps.append(micros * 1000)
                     pieces.append(Piece(at - depth - picture, depth, None))
         except (OSError, struct.error) as error:
-            raise SourceError(f"{self.file}: {error}; no .klg log, or copy it again") from None
+            raise SourceError(f"{self.file}: {error}; not a .klg log, or copy it again") from None
         if not pieces:
-            raise SourceError(f"{self.file}: holds no whole frame; no .klg log, or copy it again")
+            raise SourceError(f"{self.file}: holds no whole frame; not a .klg log, or copy it again")
         if len(pieces) < frames:
             self.notes += (f"{self.file}: ends after {len(pieces)} of {frames} frames; copy it again",)
         self._size = self._size_of(pieces[0])
@@ -73,7 +73,7 @@ class KlgLog(PackedDepth):
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses next to the file."""
         return self.poses_beside(
-            "a .klg log holds depth but no poses, nor is one .freiburg next to it; add ?poses=FILE (ElasticFusion "
+            "a .klg log holds depth but no poses, and there is no .freiburg next to it; add ?poses=FILE (ElasticFusion "
             "writes one at its end)"
         )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders with `transforms.json`, as nerfstudio, instant-ngp and many exporters of phone scans write them."""
+"""Folders with `transforms.json`, as written by nerfstudio, instant-ngp and many exporters of phone scans."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class NerfTransforms(DepthFolder):
 
     Unit: millimetres by nerfstudio's convention, unless the file has `depth_unit_scale_factor` or
     `integer_depth_scale`; floats are metres. Depth is along the optical axis.
-    Poses: `transform_matrix`, camera to world in OpenGL axes; the world is that of the file, z up by convention.
-    `applied_scale` is undone; other transforms of the world are not. Poses of COLMAP have no scale of their own:
-    where the images then do not fit together a note says so.
+    Poses: `transform_matrix`, camera to world in OpenGL axes; the world is the file's, z up by convention.
+    `applied_scale` is undone; other transforms of the world are not. Poses of COLMAP have no metric scale:
+    if the images then do not fit together, a note reports it.
     Camera: fl_x fl_y cx cy w h of the frame, else of the file, scaled to the depth images. Distorted images are
     undistorted (nearest pixel); fisheye ones are refused. Frames without a depth image are left out and counted.
     Times: number of the frame / 30 Hz.
@@ -58,7 +58,7 @@ class NerfTransforms(DepthFolder):
     axes = "opengl"
 
     def list_images(self) -> list[ImageFile]:
-        """Return the depth images that the frames name, in the order of the numbers in their names."""
+        """Return the depth images named by the frames, in the order of the numbers in their names."""
         self._cameras: list[PinholeCamera] = []
         self._table = _read(self.folder / FILE)
         every = self._table["frames"]
@@ -76,14 +76,14 @@ class NerfTransforms(DepthFolder):
         return [ImageFile(_existing(path), int(n * SECOND / self.fps)) for n, path in enumerate(paths)]
 
     def read_poses(self) -> ImagePoses:
-        """Return the poses of the frames, as they are in the file."""
+        """Return the poses of the frames, as in the file."""
         where = str(self.folder / FILE)
         scale = self._table.get("applied_scale", 1.0)
         scale = float(scale) if is_number(scale) and scale > 0 else 1.0
         return ImagePoses([_pose(frame, scale, where) for frame in self._frames], where)
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera of the file, else that of its first frame with depth; and the unit that the file says."""
+        """Return the camera of the file, else of its first frame with depth; and the unit in the file."""
         if (self.folder / "camera.toml").is_file():
             return super().find_camera(size)
         where = self.folder / FILE
@@ -122,7 +122,7 @@ def _read(path: Path) -> Table:
     table = read_json(path)
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise SourceError(f"{path}: has no list of frames; it must be as nerfstudio or instant-ngp writes it")
+        raise SourceError(f"{path}: has no list of frames; it must be as written by nerfstudio or instant-ngp")
     return table
 
 
@@ -132,7 +132,7 @@ def _depth_name(frame: Table) -> str:
 
 
 def _existing(path: Path) -> Path:
-    """Return the path, with a suffix where the file leaves it out."""
+    """Return the path, with a suffix if the file leaves it out."""
     if path.suffix.lower() in SUFFIXES:
         return path
     return next((found for suffix in SUFFIXES if (found := path.with_name(path.name + suffix)).is_file()), path)
@@ -144,7 +144,7 @@ def _pose(frame: Table, scale: float, where: str) -> Transform | str:
     except (TypeError, ValueError):
         T = np.empty(0)
     if T.shape not in ((3, 4), (4, 4)):
-        return f"{where}: transform_matrix of {_depth_name(frame)[:60]} is no 4x4 matrix; correct it"
+        return f"{where}: transform_matrix of {_depth_name(frame)[:60]} is not a 4x4 matrix; correct it"
     T = np.vstack([T[:3], [0.0, 0, 0, 1]])
     T[:3, 3] /= scale
     return T
@@ -162,7 +162,7 @@ def _camera(table: Table, size: tuple[int, int], where: Path) -> PinholeCamera:
     if "fl_x" not in numbers and is_number(table.get("camera_angle_x")):
         numbers["fl_x"] = width / 2 / math.tan(table["camera_angle_x"] / 2) if table["camera_angle_x"] else 0.0
     if "fl_x" not in numbers:
-        raise SourceError(f"{where}: tells no fl_x (or camera_angle_x) of its camera; add it, or ?camera=FILE")
+        raise SourceError(f"{where}: has no fl_x (or camera_angle_x) of its camera; add it, or ?camera=FILE")
     if width <= 0 or height <= 0 or abs(size[0] / width / (size[1] / height) - 1) > 0.02:
         raise SourceError(
             f"{where}: is for {width:g}x{height:g} pictures, depth has {size[0]}x{size[1]}; add ?camera=FILE"

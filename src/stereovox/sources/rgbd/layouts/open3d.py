@@ -13,7 +13,7 @@ LOGS = ("trajectory.log", "scene/trajectory.log", "*_scene/trajectory.log", "tra
 class Open3DFolder(DepthAndPoses):
     """`depth/` (uint16 mm) with Open3D's `trajectory.log`, also in `scene/`, or `trajectory.json`.
 
-    World: that of the poses, often the optical frame of the first camera (y down). Camera: see `DepthAndPoses`; without
+    World: the poses', often the optical frame of the first camera (y down). Camera: see `DepthAndPoses`; without
     a file, 640x480 images get 525 525 319.5 239.5, Open3D's PrimeSense default, with a note.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Raw data that the app Polycam exports (`keyframes/`), of iPhones and iPads with a lidar."""
+"""Raw data exported by the app Polycam (`keyframes/`), from iPhones and iPads with a lidar."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Polycam(DepthFolder):
     """`keyframes/depth/*.png` (uint16 mm) with `corrected_cameras/*.json`, else `cameras/`, and `confidence/`.
 
     World: ARKit's, y up. Poses are optimised by the app (`corrected_cameras`), else ARKit's, with a note. Each image
-    has its own camera, scaled from the picture's. Pixels whose confidence is low (0 of 0, 127, 255) have no value.
+    has its own camera, scaled from the picture's. Pixels of low confidence (0 of 0, 127, 255) are invalid.
     Times are in the names, in microseconds.
     """
 
@@ -52,7 +52,7 @@ class Polycam(DepthFolder):
         self._files = corrected if corrected.is_dir() else self._place / "cameras"
         if self._files != corrected:
             self.notes += (
-                f"{self._place}: has no corrected_cameras; poses are as ARKit tracked them, loops stay open",
+                f"{self._place}: has no corrected_cameras; poses are as ARKit tracked them, without loop closure",
             )
         images = images_in(self._place / "depth", r"\d+\.png", self.fps)
         self._tables = [_read(self._files / f"{image.path.stem}.json") for image in images]
@@ -84,7 +84,7 @@ class Polycam(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with depth images and cameras as Polycam names them."""
+        """Return whether `where` is a folder with depth images and cameras named as by Polycam."""
         folder = folder_part(where)
         place = os.path.join(folder, "keyframes")
         place = place if os.path.isdir(place) else folder
@@ -100,7 +100,7 @@ class Polycam(DepthFolder):
 
 
 def _read(path: Path) -> dict[str, float] | str:
-    """Return the numbers of a camera, or what is wrong with its file."""
+    """Return the numbers of a camera, or the fault of its file."""
     try:
         table: Any = json_value(read_text(path))
     except (OSError, ValueError):

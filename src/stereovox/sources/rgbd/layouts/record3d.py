@@ -74,7 +74,7 @@ class Record3D(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder as Record3D exports it."""
+        """Return whether `where` is a folder exported by Record3D."""
         folder = folder_part(where)
         return os.path.isdir(folder) and all(part.count(folder) for part in cls.parts)
 
@@ -82,7 +82,7 @@ class Record3D(DepthFolder):
 def _read(path: Path) -> dict[str, Any]:
     table = read_json(path)
     if not isinstance(table, dict):
-        raise SourceError(f"{path}: holds no table; export again")
+        raise SourceError(f"{path}: is not a table; export again")
     return table
 
 

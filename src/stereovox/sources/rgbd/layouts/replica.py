@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renderings of the Replica data set as NICE-SLAM, Co-SLAM, vMAP and many more use them."""
+"""Renderings of the Replica data set as used by NICE-SLAM, Co-SLAM, vMAP and many more."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Replica(DepthAndPoses):
     """`results/depth000000.png` with `traj.txt`, or `depth/` with `traj_w_c.txt`; 16 numbers a line, camera to world.
 
     Unit: 1/6553.5 m with traj.txt, millimetres with traj_w_c.txt. Camera: `cam_params.json` in the folder or the one
-    above, which says the unit as well, or another file; else that of the renderings, with a note. World: z up.
+    above, which also has the unit, or another file; else that of the renderings, with a note. World: z up.
     """
 
     layout = "a Replica rendering (results/depth*.png with traj.txt)"
@@ -36,7 +36,7 @@ class Replica(DepthAndPoses):
         super().__init__(where, posed)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures among the depth images, else those of a folder next to them."""
+        """Return the pictures among the depth images, else in a folder next to them."""
         return images_in(self._images[0].path.parent, r"(frame|rgb_?)\d+\.(jpg|png)", self.fps) or super().list_photos()
 
     def pose_places(self) -> list[Path]:

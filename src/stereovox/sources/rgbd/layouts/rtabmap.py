@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders that RTAB-Map exports: `rtabmap-export --images --poses_camera rtabmap.db`."""
+"""Folders exported by RTAB-Map: `rtabmap-export --images --poses_camera rtabmap.db`."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class RtabmapExport(DepthFolder):
     """`rtabmap_depth/`, `rtabmap_calib/` and `rtabmap_camera_poses.txt` or `rtabmap_poses.txt`, with any prefix.
 
     Depth: 16-bit millimetres. Poses: TUM lines, with the node's number behind them (`--poses_format 11`, the default)
-    or without (10), found by the image's time, else by the node's number. `poses.txt` is of the robot's base and is
-    combined with `local_transform` of each calibration. World: that of the graph, z up. Each image has a camera.
+    or without (10), found by the image's time, else by the node's number. `poses.txt` is for the robot's base and is
+    combined with `local_transform` of each calibration. World: the graph's, z up. Each image has a camera.
     """
 
     up = "z"
@@ -82,7 +82,7 @@ class RtabmapExport(DepthFolder):
 
 
 class _Calibration:
-    """The calibration of one image; raises SourceError if it is no pinhole camera."""
+    """The calibration of one image; raises SourceError if it is not a pinhole camera."""
 
     def __init__(self, path: Path):
         table, self.path = read_yaml(path), path
@@ -118,7 +118,7 @@ def _matrix(table: dict, key: str, count: int) -> np.ndarray | None:
 
 
 def _stamp(image: ImageFile) -> int:
-    """Return the time in the name of an image; its number stays where the name is none."""
+    """Return the time in the name of an image; else its number."""
     try:
         return ns_from_seconds(image.path.stem) if "." in image.path.stem else image.stamp_ns
     except ValueError:

@@ -31,9 +31,9 @@ SQLITE = b"SQLite format 3\0"
 TABLES = "Node", "Data", "Admin"
 RVL = b"DEPTHRVL"
 OLDEST, PACKED = (0, 11, 2), (0, 18, 0)
-"""First versions that are read, and whose calibrations are packed with their sizes."""
+"""First version that is supported, and first whose calibrations are packed with their sizes."""
 LOOPS = (1, 2, 3, 4)
-"""Types of links between places that were visited twice."""
+"""Types of links that close loops."""
 EXPORT = "export it with: rtabmap-export --images --poses_camera FILE.db"
 
 
@@ -47,7 +47,7 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True)
 class _Node:
-    """A node's number, its time in nanoseconds, T_world_base (4, 4) or why there is none, and its cameras."""
+    """A node's number, its time in nanoseconds, T_world_base (4, 4) or why it is missing, and its cameras."""
 
     id: int
     stamp_ns: int
@@ -56,11 +56,11 @@ class _Node:
 
 
 class RtabmapDatabase(DepthFolder):
-    """The depth images of a database, with the poses of its optimised graph, else those of odometry.
+    """The depth images of a database, with the poses of its optimised graph, else of odometry.
 
-    World: that of the graph, z up. Images of several cameras side by side become a frame each. Depth: PNG or RVL of
-    16-bit millimetres, or floats in metres. Nodes that are not in the optimised graph have no pose. Without such a
-    graph only the longest session counts, as each has a frame of its own, and a note says that loops are left open.
+    World: the graph's, z up. Images of several cameras next to each other become a frame each. Depth: PNG or RVL of
+    16-bit millimetres, or floats in metres. Nodes outside the optimised graph have no pose. Without such a
+    graph only the longest session is used, as each has its own frame, and a note reports that loops are left open.
     """
 
     up = "z"
@@ -68,7 +68,7 @@ class RtabmapDatabase(DepthFolder):
     certain = True
 
     def list_images(self) -> list[ImageFile]:
-        """Return the depth images in order of time, named by node and, of several cameras, their number."""
+        """Return the depth images in order of time, named by node and, for several cameras, their number."""
         self.name = self.folder.stem
         try:
             self._sqlite = SqliteFile(self.folder, TABLES, MAX_BYTES)
@@ -77,7 +77,7 @@ class RtabmapDatabase(DepthFolder):
             if isinstance(error, SourceError):
                 raise SourceError(f"{self.folder}: {error}") from None
             raise SourceError(
-                f"{self.folder}: {one_line(str(error))[:100]}; no RTAB-Map database that can be read: {EXPORT}"
+                f"{self.folder}: {one_line(str(error))[:100]}; not a readable RTAB-Map database: {EXPORT}"
             ) from None
         self._views = [(node, k) for node in self._nodes for k in range(len(node.cameras))]
         if not self._views:
@@ -107,7 +107,7 @@ class RtabmapDatabase(DepthFolder):
         return [node.id for node, _ in self._views]
 
     def size(self) -> tuple[int, int]:
-        """Return (width, height) of the images of one camera; raises SourceError if none can be read."""
+        """Return (width, height) of the images of one camera; raises SourceError if none is readable."""
         found, fault = Counter[tuple[int, int]](), "there is no image"
         for i in np.unique(np.linspace(0, len(self) - 1, 5).astype(int)).tolist():
             try:
@@ -153,7 +153,9 @@ class RtabmapDatabase(DepthFolder):
     def _read_nodes(self) -> list[_Node]:
         version = _version(self._sqlite.rows("SELECT version FROM Admin"))
         if version < OLDEST:
-            raise SourceError(f"is of RTAB-Map {'.'.join(map(str, version))}; open it once in a newer one, or {EXPORT}")
+            raise SourceError(
+                f"is from RTAB-Map {'.'.join(map(str, version))}; open it once in a newer one, or {EXPORT}"
+            )
         rows = self._sqlite.rows(
             "SELECT Node.id, Node.map_id, Node.stamp, Node.pose, Data.calibration FROM Node JOIN Data "
             "ON Data.id = Node.id WHERE length(Data.depth) > 0 AND length(Data.calibration) > 0 "
@@ -179,7 +181,7 @@ class RtabmapDatabase(DepthFolder):
         return {int(n): transform(row) for n, row in zip(numbers, matrices, strict=True)}
 
     def _by_odometry(self, rows: list[Any]) -> tuple[dict[int, Transform], list[Any]]:
-        """Return the poses of odometry by node, and the rows of the session with most of them."""
+        """Return the poses of odometry by node, and the rows of the session with the most."""
         sessions = Counter(row[1] for row in rows)
         if not sessions:
             return {}, []
@@ -237,7 +239,7 @@ def _packed(blob: bytes) -> list[Calibration]:
     found, at = [], 0
     while at < len(blob):
         if len(blob) < at + 44:
-            raise ValueError("a calibration that is cut off")
+            raise ValueError("a truncated calibration")
         _, _, _, kind, width, height, *lengths = struct.unpack_from("<11i", blob, at)
         if kind != 0:
             raise SourceError(f"holds stereo pairs, not depth; {EXPORT}, and map these as a stereo rig")
@@ -276,7 +278,7 @@ def _floats(blob: bytes) -> list[Calibration]:
 
 
 def _unpacked(blob: bytes) -> NDArray[np.uint8]:
-    """Return the bytes of a matrix that is packed with zlib, its rows, columns and type behind it."""
+    """Return the bytes of a matrix packed with zlib, followed by its rows, columns and type."""
     try:
         return np.frombuffer(zlib.decompressobj().decompress(blob, MAX_BYTES), np.uint8)
     except zlib.error as error:
@@ -284,7 +286,7 @@ def _unpacked(blob: bytes) -> NDArray[np.uint8]:
 
 
 def _rvl_depth(path: Path, content: bytes) -> Depth:
-    """Return the image packed as RVL, behind its name and its columns and rows as uint32; raises FrameRefused."""
+    """Return the image packed as RVL, after its name and its columns and rows as uint32; raises FrameRefused."""
     width, height = struct.unpack_from("<2I", content, 8) if len(content) >= 16 else (0, 0)
     if not 0 < width * height <= MAX_BYTES // 2 or width * height > 1000 * len(content):
         raise FrameRefused("unreadable", f"{path}: is damaged; leave it out")
@@ -299,5 +301,5 @@ def _version(rows: list[Any]) -> tuple[int, ...]:
     """Return the newest version in the table of versions."""
     found = [tuple(int(n) for n in re.findall(r"\d+", str(row[0]))[:3]) for row in rows]
     if not found:
-        raise ValueError("it tells no version")
+        raise ValueError("it has no version")
     return max(found)

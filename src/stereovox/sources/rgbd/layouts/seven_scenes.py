@@ -24,9 +24,9 @@ FILE = re.compile(r"frame-(\d+)\.(depth\.png|depth\.pgm|pose\.txt)")
 PHOTO = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png|ppm)")
 COLOUR = "color-intrinsics.txt"
 KINECT_COLOUR, KINECT_BASELINE = (525.0, 525.0, 319.5, 239.5), 0.025
-"""fx, fy, cx, cy of a Kinect's colour camera for 640x480, and how far it is to the right of the depth camera, metres.
+"""fx, fy, cx, cy of a Kinect's colour camera for 640x480, and its distance to the right of the depth camera, metres.
 
-These are the usual ones; single devices are some pixels and millimetres off."""
+These are typical values; single devices are some pixels and millimetres off."""
 INFO = ("info.txt", "_info.txt")
 """BundleFusion's and 3RScan's file with m_calibrationDepthIntrinsic and m_depthShift."""
 
@@ -35,13 +35,13 @@ class SevenScenes(DepthFolder):
     """`frame-000000.depth.png` (uint16 mm; 0 and 65535: no value) with `frame-000000.pose.txt` (4x4, camera to world).
 
     World: exactly that of the pose files. In 7-Scenes it is the optical frame of the first camera of the scene's model:
-    x right, y down, z forward, so z is NOT up. It is left so because ground truth and other results for these folders
-    are in it; heights in a picture are therefore distances from that first camera.
+    x right, y down, z forward, so z is NOT up. It is kept because ground truth and other results for these folders
+    use it; heights in a picture are therefore distances from that first camera.
     Camera: `camera.toml` in the folder, else `camera-intrinsics.txt` or another program's file there or one folder up,
-    also the `info.txt` of BundleFusion and 3RScan, which says the unit as well; without them, 585 585 320 240 as the
-    data set's authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
-    Time: the files hold none; frame number / 30 Hz, rounded down to whole nanoseconds.
-    Every number that has an image or a pose is a frame. Faults: those of `read_depth`, `no_pose` (no file),
+    also the `info.txt` of BundleFusion and 3RScan, which also has the unit; without them, 585 585 320 240 from the
+    data set's authors, for 640x480 only. Baseline 0.075 m (Kinect v1).
+    Time: the files have none; frame number / 30 Hz, rounded down to whole nanoseconds.
+    Every number with an image or a pose is a frame. Faults: those of `read_depth`, `no_pose` (no file),
     `bad_pose_file` (not 16 numbers).
     """
 
@@ -54,7 +54,7 @@ class SevenScenes(DepthFolder):
     certain = True
 
     def list_images(self) -> list[ImageFile]:
-        """Return the image files in the order of their numbers, which all that have a pose or an image are in."""
+        """Return the image files in the order of their numbers, one for each number with a pose or an image."""
         names = file_names(self.folder)
         numbers = {match[1] for name in names if (match := FILE.fullmatch(name))}
         suffix = "png" if any(name.endswith(".depth.png") for name in names) else "pgm"
@@ -70,14 +70,14 @@ class SevenScenes(DepthFolder):
         return find_camera(folders, size, self.baseline, self.intrinsics, (*names, *NAMES))
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the colour images of a Kinect, whose place next to the depth camera is known."""
+        """Return the colour images of a Kinect, whose mount on the depth camera is known."""
         if any(_tells_camera(folder / name) for folder in (self.folder, self.folder.resolve().parent) for name in INFO):
             return []
         found = [(int(match[1]), name) for name in file_names(self.folder) if (match := PHOTO.fullmatch(name))]
         return [ImageFile(self.folder / name, int(number * SECOND / self.fps)) for number, name in found]
 
     def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
-        """Return the camera of `color-intrinsics.txt` (3x3), else a Kinect's, and where it is, by default."""
+        """Return the camera of `color-intrinsics.txt` (3x3), else a Kinect's, and the default mount."""
         T_depth_photo = np.eye(4)
         T_depth_photo[0, 3] = KINECT_BASELINE
         return _colour_camera(self.folder, size), T_depth_photo
@@ -92,7 +92,7 @@ class SevenScenes(DepthFolder):
             return False
 
     def pose_in_file(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) just as in the file; raises FrameRefused `no_pose` or `bad_pose_file`."""
+        """Return T_world_camera (4, 4) exactly as in the file; raises FrameRefused `no_pose` or `bad_pose_file`."""
         if self._poses is not None:
             return super().pose_in_file(i)
         path = self._images[i].path
@@ -100,7 +100,7 @@ class SevenScenes(DepthFolder):
 
     @classmethod
     def depth_only(cls, where: str) -> SevenScenes:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return _Images(where)
 
 

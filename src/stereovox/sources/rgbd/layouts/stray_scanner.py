@@ -23,7 +23,7 @@ POSES, CAMERA, IMAGES, CONFIDENCE = "odometry.csv", "camera_matrix.csv", "depth"
 COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 FILE = re.compile(r"(\d+)\.(png|npy)")
 WIDTHS = (1920, 1440, 1280, 960, 640, 480)
-"""Columns that pictures of these phones may have; camera_matrix.csv is of the picture, and does not say its size."""
+"""Possible columns of these phones' pictures; camera_matrix.csv is for the picture, but lacks its size."""
 OFF_CENTRE = 0.15
 """Largest relative distance of the optical axis from the middle of the picture."""
 Row = tuple[int, Transform | str]
@@ -32,9 +32,9 @@ Row = tuple[int, Transform | str]
 class StrayScanner(DepthFolder):
     """`depth/000000.png` (uint16 mm, 256x192) with odometry.csv, camera_matrix.csv and confidence/.
 
-    World: ARKit's, y up, origin where the scan began. Poses are of the optical axes, one for each image, with its time.
-    Camera: camera_matrix.csv is of the picture (1920x1440) and is scaled to the depth images. Pixels whose confidence
-    is low (0 of 0, 1, 2) have no value. An image without a line in odometry.csv has no pose.
+    World: ARKit's, y up, origin at the start of the scan. Poses are of the optical axes, one per image, with its time.
+    Camera: camera_matrix.csv is for the picture (1920x1440) and is scaled to the depth images. Pixels of low confidence
+    (0 of 0, 1, 2) are invalid. An image without a line in odometry.csv has no pose.
     """
 
     up = "y"
@@ -58,7 +58,7 @@ class StrayScanner(DepthFolder):
             self.notes = (f"{self.folder / POSES}: has no line for {len(stamps) - len(known)} images",)
         last, files = min(known, default=0), []
         for n, stamp in zip(self._numbers, stamps, strict=True):
-            last = last + 1 if stamp is None else stamp  # without a pose it is refused anyway
+            last = last + 1 if stamp is None else stamp  # refused anyway without a pose
             files.append(ImageFile(self.folder / IMAGES / numbers[n], last))
         return files
 
@@ -75,14 +75,14 @@ class StrayScanner(DepthFolder):
         fx, fy, cx, cy = read_intrinsics(path)
         width = min(WIDTHS, key=lambda width: abs(2 * cx / width - 1))
         if abs(2 * cx / width - 1) > OFF_CENTRE:
-            raise SourceError(f"{path}: cx = {cx:g} is the middle of no usual picture; add ?camera=FILE")
+            raise SourceError(f"{path}: cx = {cx:g} is not the middle of a usual picture; add ?camera=FILE")
         factor = size[0] / width
         if abs(2 * cy * factor / size[1] - 1) > OFF_CENTRE:
             raise SourceError(
                 f"{path}: cy = {cy:g} is not the middle of pictures shaped as the depth images; add ?camera=FILE"
             )
         numbers = scaled((fx, fy, cx, cy), factor)
-        note = f"{path} is taken to be for {width} columns; its numbers are scaled to {size[0]}x{size[1]}"
+        note = f"{path} is assumed to be for {width} columns; its numbers are scaled to {size[0]}x{size[1]}"
         return FoundCamera(pinhole(size, numbers, None), (note,))
 
     def read(self, i: int) -> Depth:
@@ -92,12 +92,12 @@ class StrayScanner(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with the files that the app writes."""
+        """Return whether `where` is a folder with the files of the app."""
         return all(part.count(folder_part(where)) for part in cls.parts)
 
 
 def _rows(path: Path) -> dict[int, Row]:
-    """Return time in nanoseconds and pose, or what is wrong with it, by the number of the image."""
+    """Return time in nanoseconds and pose, or its fault, by the number of the image."""
     try:
         header, *lines = read_text(path, MAX_LIST, "replace").splitlines() or [""]
     except OSError as error:

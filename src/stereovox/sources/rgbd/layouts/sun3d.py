@@ -61,14 +61,14 @@ class Sun3d(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with depth images named so, and extrinsics."""
+        """Return whether `where` is a folder with depth images of this naming, and extrinsics."""
         folder = folder_part(where)
         images, poses = cls.parts
         return images.count(folder) > 0 and poses.count(folder) > 0 and bool(_stamped(Path(folder) / "depth"))
 
 
 def _stamped(folder: Path) -> list[ImageFile]:
-    """Return the files `NUMBER-MICROSECONDS.suffix` in order of time, of several with one time the first."""
+    """Return the files `NUMBER-MICROSECONDS.suffix` in order of time; of several at one time, the first."""
     try:
         found = {
             int(m[2]) * 1000: name for name in sorted(file_names(folder), reverse=True) if (m := FILE.fullmatch(name))

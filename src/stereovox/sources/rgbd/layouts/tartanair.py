@@ -20,7 +20,7 @@ class TartanAir(DepthFolder):
 
     Poses: `tx ty tz qx qy qz qw` a line, one for each image; x forward, y right, z down for camera and world alike, so
     z points down in the map. Camera: 320 320 and the middle of the image; baseline 0.25 m. Times: 10 images a second.
-    The sky is thousands of metres away. Where both eyes are there, the left counts.
+    The sky is thousands of metres away. If both eyes are present, the left one is used.
     """
 
     up = "-z"
@@ -47,7 +47,7 @@ class TartanAir(DepthFolder):
         return self.fitted(read_poses(self.folder / f"pose_{side}.txt"))
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
-        """Return the camera in the folder, else that of the data set."""
+        """Return the camera in the folder, else the data set's."""
         if any((self.folder / name).is_file() for name in ("camera.toml", *self.calibrations)):
             return super().find_camera(size)
         factor = size[0] / 640

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of the TUM RGB-D benchmark, and of the many tools that write its layout."""
+"""Folders of the TUM RGB-D benchmark, and of the many tools that use its layout."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ PAIRED = ("associations.txt", "association.txt", "associate.txt", "associated.tx
 """Lists of colour and depth images with their times: `stamp file stamp file`."""
 OTHER_POSES = ("*truth*.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "trajectory.txt", "poses.txt",
                "pose.txt", "*cam*pose*.txt", "*traj*.txt")  # fmt: skip
-"""Other files of poses, most of SLAM programs, in order of preference; groundtruth.txt comes first."""
+"""Other pose files, mostly of SLAM programs, in order of preference; groundtruth.txt takes precedence."""
 BONN, BONN_INTRINSICS = "rgbd_bonn", (542.822841, 542.57687, 315.59352, 237.756098)
-"""Folders of the Bonn dynamic data set, and the camera of its page."""
+"""Folders of the Bonn dynamic data set, and the camera from its web page."""
 
 
 class StampedImages(DepthFolder):
@@ -45,10 +45,10 @@ class StampedImages(DepthFolder):
 
     Without both, the depth images in `associations.txt` (lines `stamp file stamp file`).
     Camera: `camera.toml`, else `camera-intrinsics.txt` (3x3), else `calibration.txt` (fx fy cx cy), else another
-    program's file, also the only YAML, in the folder. The layout has no such file of its own; without one, 640x480
+    program's file, or the only YAML, in the folder. The layout itself has no such file; without one, 640x480
     images get 525 525 319.5 239.5, which TUM recommends for all its sequences because the depth is registered to the
     colour image with it (folders `rgbd_bonn*`: the camera of that data set). Baseline 0.075 m (Kinect v1, Xtion).
-    Images are in order of time, of several with one stamp the first counts; stamps are exact to the nanosecond.
+    Images are in order of time; of several with one stamp the first counts; stamps are exact to the nanosecond.
     Faults: see `DepthFolder`. Raises SourceError with file and line for a bad depth.txt.
     """
 
@@ -59,13 +59,13 @@ class StampedImages(DepthFolder):
     intrinsics = (525.0, 525.0, 319.5, 239.5)
 
     def list_images(self) -> list[ImageFile]:
-        """Return the image files in order of time, of several with one stamp the first."""
+        """Return the image files in order of time; of several with one stamp, the first."""
         lines = _lines(self.folder)
         images = by_time(lines)
         if len(lines) > len(images):
             self.notes = (f"{self.folder}: left out {len(lines) - len(images)} images with a stamp used before",)
         if not images:
-            raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder that has some")
+            raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder with images")
         return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in images]
 
     def list_photos(self) -> list[ImageFile]:
@@ -90,9 +90,9 @@ class StampedImages(DepthFolder):
 class TumRgbd(StampedImages):
     """Stamped images (see `StampedImages`) with `groundtruth.txt`, the poses of the optical frame.
 
-    Without it, where depth.txt or associations.txt lists the images or their names are times, those of a SLAM program
-    (`CameraTrajectory.txt` and the like), with a note. World: that of the poses (TUM's motion capture: z up).
-    Pose: between the neighbours before and after the image's time, straight in position, even in turning; both must
+    Without it, if depth.txt or associations.txt lists the images or their names are times, the poses of a SLAM program
+    (`CameraTrajectory.txt` and the like), with a note. World: the poses' (TUM's motion capture: z up).
+    Pose: interpolated between the neighbours of the image's time, linear in position and rotation angle; both must
     be less than 0.1 s away. Further faults: those of `Poses.at`.
     """
 
@@ -111,12 +111,12 @@ class TumRgbd(StampedImages):
         path = _other_poses(self.folder)
         if path is None:
             raise NoPoses(f"{self.folder}: has no {POSES}; {self.parts[-1].cure}")
-        self.notes += (f"{self.folder} has no {POSES}: poses are those of {path.name}; else add ?poses=FILE",)
+        self.notes += (f"{self.folder} has no {POSES}: using poses of {path.name}; else add ?poses=FILE",)
         return self.fitted(Trajectory(path))
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
+        """Return whether `where` is a folder with poses, and a list or folder of depth images."""
         folder = folder_part(where)
         if not super().recognises(where):
             return False
@@ -124,7 +124,7 @@ class TumRgbd(StampedImages):
 
     @classmethod
     def depth_only(cls, where: str) -> StampedImages:
-        """Return the images without looking for poses: every pose is NaN."""
+        """Return the images without searching for poses: every pose is NaN."""
         return StampedImages(where)
 
 
@@ -134,7 +134,7 @@ def _posed(where: str) -> bool:
 
 
 def _other_poses(folder: Path) -> Path | None:
-    """Return the file of a SLAM program whose lines look like stamped poses, None if missing."""
+    """Return the file of a SLAM program whose lines look like stamped poses, None if there is none."""
     paths = (path for pattern in OTHER_POSES for path in sorted(folder.glob(pattern)))
     return next((path for path in paths if _is_trajectory(path)), None)
 
@@ -170,7 +170,7 @@ def _lines(folder: Path) -> list[StampedLine]:
 
 
 def _photo_lines(folder: Path) -> list[StampedLine]:
-    """Return the pictures of a folder, [] where their list cannot be used: maps do without them."""
+    """Return the pictures of a folder, [] if their list is unusable: maps do not need them."""
     paired = next((folder / name for name in PAIRED if os.path.isfile(folder / name)), None)
     try:
         if os.path.isfile(folder / PHOTO_LIST):
@@ -194,7 +194,7 @@ def _listed(path: Path) -> list[StampedLine]:
 def _columns(path: Path) -> tuple[list[StampedLine], list[StampedLine]]:
     """Return the depth images and the pictures of lines `stamp file stamp file`.
 
-    Depth is the column with `depth` in its names, else the second of both.
+    Depth is the column with `depth` in its names, else the second.
     """
     lines = [(stamp_ns, rest.split(), where) for stamp_ns, rest, where in stamped_lines(path)]
     bad = next((where for _, words, where in lines if len(words) != 3), None)

@@ -290,10 +290,10 @@ def test_trees_that_cannot_be(tmp_path):
     one_line(path, header(binary, 1) + b"\0\0", "without children")
     one_line(path, header(binary, 2) + branch, "too early")
     one_line(path, header(binary, 3) + leaf * 2, "after the last node")
-    one_line(path, header(binary, 2) + leaf, "stand for")  # one node that claims an eighth of all there is
+    one_line(path, header(binary, 2) + leaf, "expand to")  # one node that claims an eighth of all there is
     value = np.array([1], "<f4").tobytes()
     one_line(path, header(full, 18) + (value + b"\1") * 17 + value + b"\0", "16 levels")
-    one_line(path, header(full, 1) + value + b"\0", "stand for")
+    one_line(path, header(full, 1) + value + b"\0", "expand to")
     one_line(path, header(full, 2) + (value + b"\3") * 2, "too early")
     one_line(path, header(full, 2) + (value + b"\0") * 2, "after the last node")
     nan = np.array([np.nan], "<f4").tobytes()

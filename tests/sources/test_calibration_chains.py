@@ -169,7 +169,7 @@ def test_orb_slam3(tmp_path, kind, lenses):
         import_rig(saved(tmp_path, orb(kind, lenses)))
     with pytest.raises(SourceError, match=r"Camera\.type \w+ without Camera2\.fx has one lens"):
         import_rig(saved(tmp_path, orb(kind, lenses[:1])))
-    with pytest.raises(SourceError, match="of a depth camera"):
+    with pytest.raises(SourceError, match="for a depth camera"):
         import_rig(saved(tmp_path, orb(kind, lenses[:1], **{"RGBD.DepthMapFactor": 5000})))
 
 

@@ -73,7 +73,7 @@ def test_in_the_folder_of_a_recording_it_comes_first(tmp_path):
     (folder / "camera.toml").write_text(camera_text(replace(CAMERA, baseline=None)))
     assert open_source(folder).camera.baseline == 0.075, "the data set's own, where the file tells none"
     (folder / "camera.toml").write_text(camera_text(replace(CAMERA, width=32)))
-    with pytest.raises(SourceError, match=r"camera\.toml: is of a camera with 32x12 pixels, the images have 16x12"):
+    with pytest.raises(SourceError, match=r"camera\.toml: is for a camera with 32x12 pixels, the images have 16x12"):
         open_source(folder)
 
 

@@ -217,7 +217,7 @@ def test_no_camera():
 
 def test_several_cameras_need_a_choice():
     context = Context(SoftwareCamera(rs, "1"), SoftwareCamera(rs, "2"))
-    with pytest.raises(SourceError, match="say which: realsense:1 or realsense:2"):
+    with pytest.raises(SourceError, match="choose one: realsense:1 or realsense:2"):
         RealSense("realsense:", context)
     assert RealSense("realsense:2?pose=fixed", context).name == "realsense:2"
     with pytest.raises(SourceError, match="realsense:3: not connected; there is realsense:1 or realsense:2"):

@@ -374,7 +374,7 @@ def mirror() -> np.ndarray:
 @pytest.mark.parametrize(
     ("write", "said"),
     [
-        (lambda bag: bag.scan(scan(-1)), "-1 ns must lie between 0 and 4294967296 seconds"),
+        (lambda bag: bag.scan(scan(-1)), "-1 ns must be between 0 and 4294967296 seconds"),
         (lambda bag: bag.scan(scan(2**32 * 10**9)), "must lie between 0 and 4294967296 seconds"),
         (lambda bag: bag.scan(scan(fault="unreadable", name="scan 3")), r"scan 3 has a fault \(unreadable\)"),
         (lambda bag: bag.depth(frame(np.empty((0, 0), np.uint16), fault="unreadable")), "image_raw: unreadable; only"),

@@ -223,7 +223,7 @@ def test_sizes_in_headers_are_checked_before_anything_is_decoded(tmp_path, name)
     else:
         data = data.replace(struct.pack("<4i", 0, 0, 159, 119), struct.pack("<4i", 0, 0, 99_999, 99_999))
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(FrameRefused, match="tells of") as refused:
+    with pytest.raises(FrameRefused, match="declares") as refused:
         read_depth(tmp_path / name, SIZE)
     assert refused.value.reason == "unreadable"
 

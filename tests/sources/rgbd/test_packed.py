@@ -68,7 +68,7 @@ def test_a_frame_that_swells_is_not_unpacked_whole(tmp_path):
     [
         (0, b"\5", "version 4"),
         (12 + 15 + 256 + 4, b"\2", "packed as occi"),
-        (12 + 15 + 256 + 16, b"\xff\xff\xff\xff", "tells of"),
+        (12 + 15 + 256 + 16, b"\xff\xff\xff\xff", "declares"),
         (12 + 15 + 128, b"\0\0\xc0\x7f", "camera is NaN"),
         (12 + 15 + 128, b"\0\0\0\0", "must be positive"),
     ],

@@ -19,7 +19,7 @@ def test_frames_hold_what_the_files_hold(tmp_path, listed):
     source = TumRgbd(tum(tmp_path / "desk", STAMPS, STRAIGHT, listed))
     assert (source.name, len(source)) == ("desk", 3)
     (note,) = source.notes  # three poses on a line of 0.2 s prove nothing about the unit
-    assert "taken to be in 1/5000 m" in note
+    assert "assumed to be in 1/5000 m" in note
     assert "?depth_scale=1000" in note
     for n, frame in enumerate(source):
         assert frame.fault is None
@@ -110,7 +110,7 @@ def test_without_groundtruth_the_poses_of_a_slam_program_are_used_and_named(tmp_
     assert isinstance(source, TumRgbd)
     assert [frame.fault for frame in source] == [None] * 3
     assert source.frame(1).T_world_sensor[0, 3] == pytest.approx(0.19433)
-    assert f"poses are those of {name}" in source.notes[0]
+    assert f"using poses of {name}" in source.notes[0]
     (folder / "groundtruth.txt").write_text(STRAIGHT)
     assert not any(name in note for note in open_source(folder).notes)
 

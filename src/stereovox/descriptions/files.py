@@ -214,8 +214,8 @@ def _picture(path: str, refused: str) -> Description:
         with Image.open(path) as image:
             width, height, mode = *image.size, image.mode
     except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
-        known = Path(path).suffix.lower() in SUFFIXES  # as depth, so that the reason is about what is in it
-        raise SourceError(refused if known else f"{path}: is no image that can be read; copy it again") from None
+        known = Path(path).suffix.lower() in SUFFIXES  # as depth, so that the reason names the contents
+        raise SourceError(refused if known else f"{path}: not a readable image; copy it again") from None
     kind = {"L": "8-bit grey", "RGB": "colour", "RGBA": "colour"}.get(mode, mode)
     lines = [
         f"a {kind} picture of {width}x{height}: no depth, so it makes no map by itself",

@@ -163,7 +163,7 @@ def _lines(result: dict[str, Any]) -> list[str]:
 
 def _changed(config: Config) -> dict[str, Any]:
     """Return the settings that differ from the map's profile, or that a profile file changed."""
-    profile = config.profile if config.profile in profile_names() else {}  # a file lies on what is built into Config
+    profile = config.profile if config.profile in profile_names() else {}  # a file is laid over Config's own defaults
     usual = dict(_flat(load_config(profile).model_dump(mode="json")))
     return {
         name: value

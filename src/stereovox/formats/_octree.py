@@ -41,7 +41,7 @@ def read_binary_leaves(records, corners, heights, occupied):
             if kind == 3 and height == 0:
                 raise ValueError("more than 16 levels")
             if kind < 3 and leaves >= heights.size:
-                raise ValueError("more nodes than its header says")
+                raise ValueError("more nodes than its header declares")
             corner = stack[waiting] if kind == 3 else corners[leaves]
             corner[0] = x + ((child & 1) << height)
             corner[1] = y + (((child >> 1) & 1) << height)

@@ -263,7 +263,7 @@ def _mesh(path: str | Path, kind: str) -> PointFile:
         faces = np.concatenate([np.empty((0, 3), np.int64), *(f + n for f, n in zip(faces, sizes, strict=False))])
         if prod(faces.shape) and not (faces.min() >= 0 and faces.max() < len(xyz)):
             raise ValueError("a triangle has missing corners")
-    except Exception as error:  # what a damaged file can raise in trimesh is not bounded
+    except Exception as error:  # trimesh can raise anything on a damaged file
         why = (" ".join(str(error).split()) or type(error).__name__)[:100]
         raise MapFileError(f"{path}: not a readable mesh ({why}); export it again") from None
     if not len(faces):

@@ -76,7 +76,7 @@ def read_las(path: str | Path) -> LasPoints:
         raise MapFileError(f"{path}: {DEGREES}") from None
     except struct.error:
         raise MapFileError(f"{path}: no readable points: it is cut off; copy or export it again") from None
-    except BaseException as error:  # what a damaged file can raise in laspy and its Rust library is not bounded
+    except BaseException as error:  # laspy and its Rust library can raise anything on a damaged file
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         why = (" ".join(str(error).split()) or type(error).__name__)[:120]

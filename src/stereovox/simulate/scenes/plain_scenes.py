@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simple scenes of Chien 2020: `sim:aisle` (Fig 4.12), `sim:box` (4.4.1) and `sim:wall` (Appendix B)."""
+"""Simple scenes from Chien 2020: `sim:aisle` (Fig 4.12), `sim:box` (4.4.1) and `sim:wall` (Appendix B)."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class KittiSource(Source, ABC):
 
     @abstractmethod
     def velodyne(self, i: int) -> Path:
-        """Return the scan's file of frame `i`."""
+        """Return the scan file of frame `i`."""
 
     def pair(self, i: int) -> StereoPair:
         """Return the stereo pair of frame `i`."""

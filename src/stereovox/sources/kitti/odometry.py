@@ -89,7 +89,7 @@ class KittiOdometry(KittiSource):
         return self._stamps[i]
 
     def velodyne(self, i: int) -> Path:
-        """Return the scan's file of frame `i`."""
+        """Return the scan file of frame `i`."""
         return self.folder / "velodyne" / f"{i:06d}.bin"
 
     def _poses(self, choice: str, axes: str, inverted: bool) -> FramePoses:

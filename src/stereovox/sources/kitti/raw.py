@@ -88,7 +88,7 @@ class KittiRaw(KittiSource):
         return self._stamps[i]
 
     def velodyne(self, i: int) -> Path:
-        """Return the scan's file of frame `i`."""
+        """Return the scan file of frame `i`."""
         return self.folder / "velodyne_points" / "data" / f"{i:010d}.bin"
 
     def imu(self) -> ImuReadings | None:

@@ -73,7 +73,7 @@ class KittiStereo2015(KittiSource):
         return int(self._scenes[i]) * 1_000_000_000
 
     def velodyne(self, i: int) -> Path:
-        """Return the scan's file of frame `i`."""
+        """Return the scan file of frame `i`."""
         return self.folder / "velodyne" / f"{self._scenes[i]}.bin"
 
     def pair(self, i: int) -> StereoPair:

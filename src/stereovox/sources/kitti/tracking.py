@@ -81,7 +81,7 @@ class KittiTracking(KittiSource):
         return int(i * SECOND_NS / self._fps)
 
     def velodyne(self, i: int) -> Path:
-        """Return the scan's file of frame `i`."""
+        """Return the scan file of frame `i`."""
         return self.folder / "velodyne" / self.sequence / f"{i:06d}.bin"
 
     def boxes(self, i: int) -> tuple[Box, ...]:

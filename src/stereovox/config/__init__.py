@@ -44,23 +44,21 @@ class Config(Section):
         max_range: Largest depth along the optical axis that is used.
         up: The axis of the world that points up (`z`, `-y`, ...); pictures and heights follow it.
         up_direction: Unit vector that points up, if no axis does so exactly; `up` is then the nearest axis.
-        levelled_from: Direction in the recording's world that is z in this map; set when `map --level` rotates the
-        poses.
+        levelled_from: Direction in the recording's world that is z in this map; `map --level` sets
+            it when it rotates the poses.
         blind_range: Depth in metres below which a camera clears no cells, because it measures nothing that near. Not
             set: 0.3, but at most a tenth of max_range and at least min_range.
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
         device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
             without a window, `max_memory`, `map.keep_times`, `map.keep_frames` or `sphere`. Without such a card, `cpu`
-            is
-            used and a note is printed.
+            is used and a note is printed.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out if frames take longer. Not set:
             no limit.
         max_memory: Bytes that the cells may take, as a number or like "500 MB".
-        when_full: When memory runs out, refuse frames that need more (`refuse`), or keep a window of that size round
-        the
-            camera and drop what leaves it (`roll`) or keep it on disk (`spill`).
+        when_full: When memory runs out, refuse frames that need more (`refuse`), or keep a window of that size
+            round the camera and drop what leaves it (`roll`) or keep it on disk (`spill`).
         trust: Which frames may change the map; see TrustConfig.
         pace: What is left out under `deadline_ms`; see PaceConfig.
         sensor: Inverse sensor model; see SensorConfig.

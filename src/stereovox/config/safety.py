@@ -26,8 +26,7 @@ class TrustConfig(Section):
         its sensor; 1: not checked.
     pose_error_m: occasional pose error in metres; a frame may disagree by this, relative to the size of a cell.
     changed_s: shortest time in seconds for which frames must disagree with the map before a changed world is accepted,
-    if
-        they show one; time alone is no evidence.
+        if they show one; time alone is no evidence.
     moved_s: seconds after which frames are accepted that would agree with the map from another pose; not set: never.
     """
 

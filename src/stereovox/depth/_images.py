@@ -20,8 +20,7 @@ def classify(raw, scale, min_range, max_range, none, infinite, given, far, depth
     none: a raw value that means "no value" in addition to zero, negative ones and NaN (65535 in uint16 images). -inf is
     too near. infinite: what +inf means: itself (too far), or NaN (unknown). given: the source's own reasons, which take
     precedence; empty: it has none. far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or
-    too
-    near, overrides it.
+    too near, overrides it.
     """
     valid = np.int64(0)
     for start in range(0, raw.size, CHUNK):

@@ -32,10 +32,9 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
 
     Points without value, and points nearer than the lidar's or the settings' minimum range, are left out: their rays
     clear nothing. Rays beyond the lidar's own maximum range end there without a surface, and at least four sigma in
-    front
-    of their point.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
-    `bad_shape`, `too_many_points`, `bad_units`, `no_valid_point`, `too_few_values`, `no_surfaces`, and as `rigid_pose`.
+    front of their point. Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of
+    `validate_fields`, `bad_dtype`, `bad_shape`, `too_many_points`, `bad_units`, `no_valid_point`, `too_few_values`,
+    `no_surfaces`, and as `rigid_pose`.
     """
     validate_fields(cloud, Cloud)
     T = rigid_pose(cloud, config.pose_rigidity_tolerance)

@@ -118,11 +118,10 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
 
     Even so, a rod one or two pixels wide, two to three sigma before its wall, is mostly averaged into it, and rays past
     it then clear its cells. So finally a pixel takes the mean of a line of five measured pixels (vertical, horizontal
-    or
-    diagonal) if that is nearer, and both halves of the line are 1.5 sigma in front of both sides: three
-    pixels on, after all passes. Noise alone does so at one pixel in a thousand. This is left out up to three times
-    FINE cells of noise, as the last pass is, and unless `depth.keep_lines` is set. Registration goes without it:
-    there, the few pixels that noise puts in front matter more than thin objects.
+    or diagonal) if that is nearer, and both halves of the line are 1.5 sigma in front of both sides: three pixels on,
+    after all passes. Noise alone does so at one pixel in a thousand. This is left out up to three times FINE cells of
+    noise, as the last pass is, and unless `depth.keep_lines` is set. Registration goes without it: there, the few
+    pixels that noise puts in front matter more than thin objects.
 
     Limitation: a step of less than about two sigma is smoothed over some pixels.
     """

@@ -37,21 +37,17 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
 
     The scan's sensor is at the camera, upright, with its x axis along the camera's viewing direction; ranges are metres
     along the floor. The mount on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows`
-    takes
-    the nearest of a few rows round the level one (the job of depthimage_to_laserscan), `cloud` the nearest
-    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose centre it covers,
-    or else to the one that contains its own centre. Any camera will do; rays that point backwards or are steeper than
-    80
+    takes the nearest of a few rows round the level one (the job of depthimage_to_laserscan), `cloud` the nearest of all
+    points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose centre it covers, or else
+    to the one that contains its own centre. Any camera will do; rays that point backwards or are steeper than 80
     degrees are ignored.
 
     A beam is -inf, and free nowhere, if something too near may be within the heights; else it has the range
     of its nearest point; else +inf if it is free all the way to `max_range`, else NaN. `clear` is the distance up to
     which some ray of the beam was seen to be free *within the heights*. Beyond the end of all its rays, or their exit
-    from
-    the heights, it is unknown. One ray is enough, as with a lidar: an object lower than all rays of its beam is not
-    seen,
-    and its place counts as free. Points beyond `max_range` along the floor are dropped: their rays are free up to
-    there.
+    from the heights, it is unknown. One ray is enough, as with a lidar: an object lower than all rays of its beam is
+    not seen, and its place counts as free. Points beyond `max_range` along the floor are dropped: their rays are free
+    up to there.
 
     Raises FrameRefused: `camera_tilted` if no row is level (method `rows`), `camera_vertical` if the camera
     points straight up or down, `heights_not_seen` if no ray meets the heights; ConfigError if z is not up.

@@ -40,8 +40,7 @@ class Place(ABC):
 
     A file is written whole or not at all, and is stored when `write` returns. Places can be pickled; a process
     that receives one opens its own connection. All methods raise MapFileError, one line with the file, the reason and
-    the
-    cure.
+    the cure.
     """
 
     @staticmethod

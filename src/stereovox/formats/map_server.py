@@ -69,8 +69,7 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
     """Write an image and its .yaml; `path` names either (a .yaml's image is a .pgm, a scaled one a .png).
 
     Both or neither: after a power failure the .yaml still names an image that belongs to it, perhaps one with a
-    temporary
-    name.
+    temporary name.
 
     trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
     are transparent and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled

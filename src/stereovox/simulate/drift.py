@@ -24,9 +24,8 @@ def drifting(path: CameraPath, seconds: float, share: float, random: np.random.G
 
     path: the true one, world z up; it takes `seconds`. share: metres of error per metre travelled, in all directions;
     the heading drifts too (`YAW_DEG`), roll and pitch stay right. The first pose is true, and errors belong to
-    positions
-    on the path, not to images: they are the same for any number of frames. Raises StereovoxError if the first pose
-    has no heading.
+    positions on the path, not to images: they are the same for any number of frames. Raises StereovoxError if the first
+    pose has no heading.
     """
     shares = np.linspace(0, 1, max(2, math.ceil(seconds / STEP_S) + 1))
     true = np.array([path(step) for step in shares.tolist()])

@@ -192,8 +192,7 @@ class Simulation(DepthSource):
         """Return the camera's frame from any pose off its path, world z up.
 
         T_world_camera: (4, 4), the true pose. number: different numbers give different noise. T_reported: the pose of
-        the
-        frame; None: the true one.
+        the frame; None: the true one.
         """
         reported = T_world_camera if T_reported is None else T_reported
         depth_m = self._cast(T_world_camera)

@@ -43,9 +43,8 @@ class Surround(Source):
 
     location: `sim:surround` or with parameters `sim:surround?pair=front&scale=0.5`, see `Options`. The images are
     raw, with the lenses' distortion. World: z up, metres; the drone's body is level, x forward, y left, z up. Frames
-    can
-    be read in any order and are always the same for the same `seed`.
-    Raises SourceError for an unknown parameter and for values out of range.
+    can be read in any order and are always the same for the same `seed`. Raises SourceError for an unknown parameter
+    and for values out of range.
     """
 
     layout = "four stereo cameras round a drone (sim:surround)"

@@ -53,11 +53,9 @@ class ImuReadings:
         stamps_ns: (N,) int64 nanoseconds, ascending.
         angular_rate: (N, 3) float64 rad/s about the IMU's axes, finite.
             specific_force: (N, 3) float64 m/s^2 along the IMU's axes: an accelerometer's reading, at rest 9.8 upwards;
-            NaN
-                if missing.
+                NaN if missing.
             T_sensor_imu: (4, 4) float64, maps the IMU's frame into the optical frame of the images; only its rotation
-            is
-                used.
+                is used.
             name: Origin of the readings, for messages.
 
         Raises:

@@ -47,8 +47,7 @@ class Settings(NamedTuple):
     """Settings of `match`, in integers.
 
     radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) cost of larger ones, by the
-    step
-    of grey between both pixels. unique: per cent by which the second best match must be worse. left_right: largest
+    step of grey between both pixels. unique: per cent by which the second best match must be worse. left_right: largest
     difference of the disparities of both images, in pixels; negative: any. share: a window's sum of costs times this,
     without its lower 16 bits, is the pixel's cost, at most 255 - p1 - the greatest of `jumps`. disparities: number that
     may be chosen.
@@ -167,8 +166,7 @@ def match(left, right, start, first, end, settings, scratch, raw):
     """Fill rows `first` to `end` of `raw` (h, w) int16 with disparities in 1/16 px by paths right, left and down.
 
     left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored; both from `describe`. start: the row from which the
-    downward
-    path starts. settings: Settings; scratch: StripScratch. Without a value: NONE.
+    downward path starts. settings: Settings; scratch: StripScratch. Without a value: NONE.
     """
     height, radius = raw.shape[0], np.int64(settings.radius)
     p1, jumps, share = np.uint8(settings.p1), settings.jumps, np.uint32(settings.share)

@@ -118,8 +118,7 @@ def explained(
     image: (height, width) uint8 that `raw` is aligned with. valid, valid_other: (height, width) bool of that image and
     of the other, None: all may be used. A pixel is MASKED if it or its match is, and in cropped
     columns. TOO_NEAR: the best match is the last one searched; a nearer one may be missing. TOO_FAR: certainly less
-    than
-    half a pixel, with texture. Other pixels without a value are UNMATCHED.
+    than half a pixel, with texture. Other pixels without a value are UNMATCHED.
     """
     right = config.aligned == "right"
     side = 1 if right else -1

@@ -82,9 +82,8 @@ class FloorPlan:
         """Return a perfect map of the floor as seen from the point `inside` (2,).
 
         Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: other
-        cells
-        that can be reached from `inside`. Unknown: cells behind the surfaces; `with_lids` adds tops and undersides.
-        Cell corners are at whole multiples of `resolution`.
+        cells that can be reached from `inside`. Unknown: cells behind the surfaces; `with_lids` adds tops and
+        undersides. Cell corners are at whole multiples of `resolution`.
         """
         from scipy import ndimage
 

@@ -2,8 +2,7 @@
 """`sim:apartment`: five rooms round a hall, with straight walls and right angles (Chien 2020, 4.4.2.1).
 
 Plan coordinates in metres: floor at 0, x east, y north. `SHIFT` offsets everything by odd millimetres, so that no wall
-is
-exactly on a cell's face for any round cell size.
+is exactly on a cell's face for any round cell size.
 """
 
 from __future__ import annotations
@@ -158,8 +157,7 @@ def stage(*, speed: float = 0.8) -> Stage:
     The path begins and ends at the same place, so that a drifting tracker revisits it. The camera sways as in a hand.
     World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture. faces: the
     four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture stands in front
-    of
-    them. Raises SourceError for values out of range.
+    of them. Raises SourceError for values out of range.
     """
     within("speed", speed, 0.1, 5)
     T_world_plan = np.eye(4)

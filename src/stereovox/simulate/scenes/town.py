@@ -41,10 +41,9 @@ def stage(*, blocks: int = 6, drive: int = 0, length: float = 120.0, speed: floa
     """Return a town of blocks x blocks blocks, 50 m each, and a drive of `length` metres at `speed` m/s.
 
     town: seed of the town's contents; drive: seed of the route, which chooses at every crossing. 10 images a second,
-    640
-    pixels wide, from a stereo camera with a baseline of 0.12 m and a range of 20 m. World: z up, origin in the town's
-    middle. Parts: `ground`, `pavements`, `houses`, `lamps`, `trees`, `signs`, `bollards`, `cars`.
-    Raises SourceError for values out of range.
+    640 pixels wide, from a stereo camera with a baseline of 0.12 m and a range of 20 m. World: z up, origin in the
+    town's middle. Parts: `ground`, `pavements`, `houses`, `lamps`, `trees`, `signs`, `bollards`, `cars`. Raises
+    SourceError for values out of range.
     """
     within("blocks", blocks, 1, 40)
     within("length", length, 1, 100_000)

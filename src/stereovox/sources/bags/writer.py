@@ -181,8 +181,7 @@ class BagWriter:
         """Write the constant pose of a frame in its parent, (4, 4), on `/tf_static`.
 
         All poses given so far go into one message before the next message of another kind, since only the last message
-        of
-        this topic is kept for late subscribers.
+        of this topic is kept for late subscribers.
         """
         self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
         self._due = True

@@ -21,8 +21,7 @@ USUAL_NS, ANNOUNCED_NS = 80_000_000, 20_000_000
 set back."""
 START_NS = 300_000_000
 """Tolerated difference of the delays of images and poses at the start: both the camera and the source of poses take
-some
-time to deliver."""
+some time to deliver."""
 SETTLE_NS = 1_000_000_000
 """Time from the first image during which the usual delay is measured."""
 OPEN, GONE, LATE, CLOCK = "", "gone", "late", "clock"
@@ -97,8 +96,7 @@ class Heard(NamedTuple):
     """State of a message's stamp at its arrival.
 
     doubt: the doubt it belongs to; None: none. set_back: how often the poses' clock had been set back. judged: whether
-    it
-    could be judged; else it shares a later doubt.
+    it could be judged; else it shares a later doubt.
     """
 
     doubt: ClockDoubt | None = None

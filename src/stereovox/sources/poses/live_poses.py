@@ -24,8 +24,7 @@ RESET_NS = 1_000_000_000
 """A pose this much older than the newest one means that the clock was set back: all earlier ones are dropped."""
 SET_BACK, REORDERED_NS = 3, 50_000_000
 """This many consecutive poses, ascending as time passes but all older than the newest one, mean the same. A pose that
-is
-older by more than messages overtake each other waits for the next ones, since it may use another clock."""
+is older by more than messages overtake each other waits for the next ones, since it may use another clock."""
 RIGID = 1e-3
 """Largest rigidity error of a usable pose."""
 MAX_SPEED_MPS, MAX_TURN_DPS = 10.0, 720.0

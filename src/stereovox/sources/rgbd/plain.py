@@ -50,8 +50,7 @@ class DepthAndPoses(DepthFolder):
     Poses: see `pose_files` for the forms; those over time need images whose names are times, all others are one for
     each image, in order of the numbers in the names. World: the poses'.
     Unit: millimetres by convention, else found from the poses (see `depth_unit`). Camera: see `find_camera`; there is
-    no
-    default. Ground robots, hand-held scanners, simulators: the user must check the poses and the camera.
+    no default. Ground robots, hand-held scanners, simulators: the user must check the poses and the camera.
     """
 
     layout = "depth images with a file of poses (depth/ with poses.txt, trajectory.log or traj.txt)"

@@ -45,8 +45,7 @@ def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
     """Return the poses in a file or folder of any form (see `rgbd.pose_files`), over time.
 
     stamps_ns: times of the images in ascending order. Poses without times are assigned one to each image; so are poses
-    whose
-    times do not overlap the images', if their numbers are equal. Raises SourceError if they are not.
+    whose times do not overlap the images', if their numbers are equal. Raises SourceError if they are not.
     """
     found, stamps = read_poses(path), sorted(set(stamps_ns))
     if isinstance(found, Poses):

@@ -83,7 +83,7 @@ def test_a_pose_that_cannot_be_used_refuses_what_needs_it(bad):
 
 def test_without_any_pose_the_reason_is_told():
     poses = LivePoses("tracker")
-    assert "tracker: no pose has come yet" in str(refused(poses, 0))
+    assert "tracker: no pose has arrived yet" in str(refused(poses, 0))
     poses.end("the server hung up")
     assert "tracker: the server hung up" in str(refused(poses, 0))
 

@@ -47,7 +47,7 @@ def test_other_text_is_an_error_with_an_example(text):
 
 @pytest.mark.parametrize("text", ["10:", "5:5", "3:1", "0:5:-1"])
 def test_an_empty_selection_is_an_error(text):
-    with pytest.raises(SourceError, match=f"'{text}' picks none of the 10 frames of counting"):
+    with pytest.raises(SourceError, match=f"'{text}' selects none of the 10 frames of counting"):
         Selection(Counting(), text)
 
 

@@ -24,6 +24,7 @@ from stereovox.kernels.device import check_on_processor, on_usable_device
 from stereovox.kernels.threads import MapLock, uninterrupted
 from stereovox.mapping.comparison import Comparison
 from stereovox.mapping.deadline import Deadline, Levels
+from stereovox.mapping.floor_comparison import FloorComparison
 from stereovox.mapping.gate import GateResult
 from stereovox.mapping.intake import Aged, Intake
 from stereovox.mapping.rebuild import CorrectionReport, FramePoses, correct
@@ -290,6 +291,7 @@ class GridMapper(Aged):
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
+        self._comparison = FloorComparison(self.config, self._intake.gate, isinstance(resume, OccupancyGrid))
 
     def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
@@ -309,6 +311,7 @@ class GridMapper(Aged):
             passed = offer.check(scan)
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
+            passed = self._comparison.check(frame, scan, evidence, passed, self.map)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
                 cells = self.map.add(evidence)

@@ -261,10 +261,11 @@ def _lit(value: int) -> Callable[[str], list[Case]]:
 
 def _contradicting(kind: str) -> list[Case]:
     """The wall or the room is half as far as it was."""
-    before = [good(kind, n) for n in range(7, 12)]
-    halved = {} if kind == PAIR else {MEASURED[kind]: getattr(good(kind, 12), MEASURED[kind]) * np.float32(0.5)}
-    bad = _pair(12, 8) if kind == PAIR else good(kind, 12, **halved)
-    return [Case(bad, before, {"voxel_size": 0.03, "stereo.subpixel": 0.05})]
+    before = [good(kind, n) for n in range(5, 12)]
+    pair = kind in (PAIR, PAIR_SCAN)
+    halved = {} if pair else {MEASURED[kind]: getattr(good(kind, 12), MEASURED[kind]) * np.float32(0.5)}
+    bad = _pair(12, 8) if pair else good(kind, 12, **halved)
+    return [Case(bad, before, {"voxel_size": 0.03, "stereo.subpixel": 0.05, "scan.method": "rows"})]
 
 
 def _doubted(fits: int) -> Callable[[str], list[Case]]:

@@ -38,6 +38,15 @@ def scan_cells(scan: Scan, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)) 
     return {cell: evidence for cell, evidence in sums.items() if evidence}
 
 
+def scan_beams(scan: Scan, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Return from where and up to where each beam clears, and where it hits, (N, 6) in cells, as `GridEvidence.ends`."""
+    rows = []
+    for start, free, hit, _ in _beams(scan, config, origin):
+        places = (start if free else None, free, hit)
+        rows.append([float(x) for place in places for x in (place or (np.nan, np.nan))])
+    return np.array(rows)
+
+
 def touched(start: Place, end: Place) -> list[Cell]:
     """Return the cells a line from `start` to `end` touches: cut it at all grid lines, take each part's middle."""
     cuts = {Fraction(0), Fraction(1)}

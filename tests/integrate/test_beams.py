@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from naive_beams import scan_cells
+from naive_beams import scan_beams, scan_cells
 
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused
@@ -58,6 +58,7 @@ def test_kernels_equal_the_reference(traversal, update, thickness, voxel_size):
         ours = cells_of(config, scan, origin)
         assert len(ours) > 100
         assert ours == scan_cells(scan, config, origin)
+        np.testing.assert_array_equal(make_beams(config).evidence(scan, origin).ends, scan_beams(scan, config, origin))
 
 
 @pytest.mark.parametrize(("traversal", "update"), KINDS)

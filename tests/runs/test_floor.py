@@ -246,3 +246,23 @@ def test_nothing_is_looked_for_twice(tmp_path, monkeypatch):
         going.find_track()
         monkeypatch.setattr(floor_run, "slam_robot", lambda *_: pytest.fail("again"))
         assert going.finish().track is going.find_track()
+
+
+@pytest.mark.parametrize(
+    ("options", "settings", "compared"),
+    [
+        ({"poses": "odometry"}, {}, False),
+        ({"poses": "odometry"}, {"trust.max_disagreement": 0.2}, True),
+        ({"poses": "slam"}, {}, True),
+        ({"poses": "first.yaml", "start": (0, 0, 0)}, {}, False),
+        ({"resume": "first.yaml", "start": (0, 0, 0)}, {}, True),
+        ({"resume": "first.yaml", "poses": "odometry"}, {}, False),
+    ],
+)
+def test_scans_are_compared_where_poses_are_good_enough(tmp_path, monkeypatch, options, settings, compared):
+    monkeypatch.chdir(tmp_path)
+    sv.map_floor(DRIVE, "first.yaml", **LIDAR)
+    told = []
+    made = sv.map_floor(DRIVE, "a.yaml", use="lidar", notify=told.append, **options, **settings)
+    assert (made.map.config.trust.max_disagreement < 1) == compared
+    assert any("are not compared" in line for line in told) != compared

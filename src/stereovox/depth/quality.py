@@ -151,7 +151,8 @@ def check_scan(scan: Scan, config: Config) -> None:
     at = np.flatnonzero(hit)
     if config.trust.min_surface_share and len(at) > FEW_BEAMS:
         gap = abs(float(scan.angle_step)) * np.diff(at)
-        share = _alike(ranges[at], np.arange(len(gap)), np.arange(1, len(at)), gap, BEAM_SIGMA_M)
+        least = config.trust.min_surface_share
+        share = _alike(ranges[at], np.arange(len(gap)), np.arange(1, len(at)), gap, BEAM_SIGMA_M, least)
         _check_alike(scan, lambda _: share, config)
 
 
@@ -198,10 +199,12 @@ def _alike(
     next_to_it: NDArray[np.integer],
     gap: NDArray[np.floating],
     sigma: float,
+    enough: float = 1.0,
 ) -> float:
     """Return how similar ranges (N,) are to those in nearly the same direction: 1 fully, 0 as any two of them.
 
     one, next_to_it: (Q,) rows of ranges that are next to each other; gap: (Q,) radians between them; sigma: metres.
+    enough: a share that need not be known exactly; at least so much is then returned.
 
     A pair counts fully if both may be on one surface that is seen under at least 45 degrees. Otherwise it counts by
     the share of all ranges that are farther from the one than its neighbour is: half on average if ranges are random,
@@ -209,9 +212,11 @@ def _alike(
     """
     logs = np.log(ranges)
     off = np.abs(logs[one] - logs[next_to_it])
+    on_surface = off <= gap + ALIKE + ALIKE_SIGMA * sigma / ranges[one]
+    if (least := 2 * float(on_surface.mean()) - 1) >= enough:
+        return least
     ordered = np.sort(logs)
     below, above = np.searchsorted(ordered, logs[one] - off, "right"), np.searchsorted(ordered, logs[one] + off, "left")
-    on_surface = off <= gap + ALIKE + ALIKE_SIGMA * sigma / ranges[one]
     return float(2 * np.where(on_surface, 1.0, 1 - (above - below) / len(ordered)).mean() - 1)
 
 

@@ -30,14 +30,15 @@ def _grain(place):
 
 
 @kernel
-def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, free, hits, taken_back, box):
+def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, free, hits, taken_back, reads, box):
     """Write where beams clear and where they hit, as lines (n, 4) from x, y to x, y in cells; return how many of each.
 
     directions: (N, 2) cosines and sines in the sensor's frame. turn: (2, 2) from there to cells. position: (2,) of the
     sensor in cells. limits: (3,) float32 nearest range that counts, farthest that does, farthest the sensor measures.
     clear: (N,), or empty where ranges alone tell; clear_from: (N,), or empty if it is from the sensor on.
-    taken_back: points in cells that are hit and that the line before clears. box: (4,) lowest column and row, highest
-    column and row of all.
+    taken_back: points in cells that are hit and that the line before clears. reads: (N, 6) of each beam from where and
+    up to where it clears, and where it hits; NaN for nothing. box: (4,) lowest column and row, highest column and row
+    of all.
     """
     nearest, reach, farthest = limits[0], limits[1], limits[2]
     x, y = _grain(position[0]), _grain(position[1])
@@ -56,8 +57,10 @@ def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, f
         to_x, to_y = _grain(position[0] + dx * known), _grain(position[1] + dy * known)
         since = max(clear_from[i], ZERO) if clear_from.size > 0 else ZERO
         known = known if since < known else 0.0
+        reads[i] = np.nan
         if known > 0:
             from_x, from_y = _grain(position[0] + dx * since), _grain(position[1] + dy * since)
+            reads[i, 0], reads[i, 1], reads[i, 2], reads[i, 3] = from_x, from_y, to_x, to_y
             free[lines, 0], free[lines, 1], free[lines, 2], free[lines, 3] = from_x, from_y, to_x, to_y
             lines += 1
             low_x, low_y = min(low_x, np.floor(to_x)), min(low_y, np.floor(to_y))
@@ -66,6 +69,7 @@ def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, f
             at_x, at_y = _grain(position[0] + dx * measured), _grain(position[1] + dy * measured)
             end = measured + behind
             end_x, end_y = _grain(position[0] + dx * end), _grain(position[1] + dy * end)
+            reads[i, 4], reads[i, 5] = at_x, at_y
             hits[ends, 0], hits[ends, 1], hits[ends, 2], hits[ends, 3] = at_x, at_y, end_x, end_y
             ends += 1
             low_x, low_y = min(low_x, np.floor(at_x), np.floor(end_x)), min(low_y, np.floor(at_y), np.floor(end_y))

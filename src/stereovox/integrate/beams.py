@@ -56,7 +56,7 @@ class Beams:
         occupied, free = (to_units(log(p / (1 - p))) for p in (grid.p_occupied, grid.p_free))
         self._occupied, self._free = int(max(occupied, 1)), int(min(free, -1))
         self._values, self._coords = np.empty((0, CELLS), dtype), np.empty((0, 3), np.int32)
-        self._lines = tuple(np.empty((0, 4)) for _ in range(3))
+        self._lines, self._ends = tuple(np.empty((0, 4)) for _ in range(3)), np.empty((0, 6))
         self._seen: tuple[float, float, int] | None = None
         self._directions = np.empty((0, 2))
 
@@ -71,7 +71,7 @@ class Beams:
         The memory of the evidence is reused by the next call.
         Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
         """
-        lines, box = self._aim(scan, np.asarray(origin, float))
+        lines, ends, box = self._aim(scan, np.asarray(origin, float))
         if not sum(map(len, lines)):
             return GridEvidence.nothing()
         low, high = np.floor_divide(box.reshape(2, 2), SIDE)
@@ -85,10 +85,12 @@ class Beams:
             passes.append((taken_back, -self._free))
         for what, gain in passes:
             self._traverse(what, low * SIDE, columns, rows, dtype(gain), self._adding, flat)
-        return GridEvidence(coords, values)
+        return GridEvidence(coords, values, ends)
 
-    def _aim(self, scan: Scan, origin: NDArray[np.float64]) -> tuple[list[NDArray[np.float64]], NDArray[np.int64]]:
-        """Return the lines to clear, to occupy, and those whose clearing a hit cancels, in cells, and their box."""
+    def _aim(
+        self, scan: Scan, origin: NDArray[np.float64]
+    ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], NDArray[np.int64]]:
+        """Return the lines to clear, to occupy, those whose clearing a hit cancels, each beam's ends, and their box."""
         size, config = self._config.voxel_size, self._config
         ranges, clear, clear_from = _beams_of(scan)
         T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
@@ -101,13 +103,14 @@ class Beams:
         with np.errstate(over="ignore"):
             limits = np.array([scan.range_min, reach, scan.range_max], np.float32)
         if len(self._lines[0]) < len(ranges):
-            self._lines = tuple(np.empty((len(ranges), 4)) for _ in range(3))
+            self._lines, self._ends = tuple(np.empty((len(ranges), 4)) for _ in range(3)), np.empty((len(ranges), 6))
+        ends = self._ends[: len(ranges)]
         box = np.empty(4, np.int64)
         counts = _beams.aim(
             ranges, clear, clear_from, self._directions_of(scan), T[:2, :2] / size, position, limits,
-            config.grid.thickness, *self._lines, box,
+            config.grid.thickness, *self._lines, ends, box,
         )  # fmt: skip
-        return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], box
+        return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], ends, box
 
     def _directions_of(self, scan: Scan) -> NDArray[np.float64]:
         """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""

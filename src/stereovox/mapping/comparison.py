@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.rigs import VirtualCamera
@@ -19,6 +20,7 @@ from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
+from stereovox.maps.query.queries import RayHits
 from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import DisagreementSpell
 from stereovox.sensors import make_sensor
@@ -117,18 +119,46 @@ class Comparison:
 
     def _sight(self, image: AnyImage, doubt: DisagreementSpell | None, voxel_map: VoxelMap) -> Sight:
         """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
-        T, seen = image.T_world_sensor, _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range)
-        points = _thinned(seen, POINTS)
-        tolerance = np.maximum(voxel_map.voxel_size, self._noise[image.camera].sigma(np.linalg.norm(points, axis=1)))
-        placed = _placed(voxel_map, T, points, tolerance)
-        against = placed.against
-        known = int((placed.agrees | against).sum())
-        anchored = float(placed.agrees.sum()) / known if known >= max(FEW, MOSTLY_KNOWN * len(points)) else None
-        votes, frames = Votes(), 0
-        if doubt is not None and doubt.glance is not None:
-            votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
-        fault = _fault(voxel_map, image, points, tolerance, placed, align=frames % EVERY == 0)
-        return Sight(anchored, fault, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
+        seen, sigma = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), self._noise[image.camera].sigma
+        return sight(voxel_map, image.T_world_sensor, seen, sigma, doubt, partial(_fault, voxel_map, image))
+
+
+class Surfaces(Protocol):
+    """A map that points are looked up in, as `VoxelMap` has it; what is no surface is FREE or UNKNOWN."""
+
+    @property
+    def voxel_size(self) -> float: ...
+
+    def state(self, points: ArrayLike) -> NDArray[np.uint8]: ...
+
+    def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits: ...
+
+
+def sight(
+    surfaces: Surfaces,
+    T: Transform,
+    seen: NDArray[np.float64],
+    sigma: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    doubt: DisagreementSpell | None,
+    fault: Callable[[NDArray[np.float64], NDArray[np.float64], Placed, bool], str],
+) -> Sight:
+    """Return how a frame in doubt lies in a map.
+
+    seen: (N, 3) points in the sensor's frame, at pose T. sigma: their noise by their distance, in metres. fault:
+    returns the name of what is wrong, by some of the points, their tolerances, how they lie, and whether there is time
+    to seek another pose.
+    """
+    points = _thinned(seen, POINTS)
+    tolerance = np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
+    placed = _placed(surfaces, T, points, tolerance)
+    against = placed.against
+    known = int((placed.agrees | against).sum())
+    anchored = float(placed.agrees.sum()) / known if known >= max(FEW, MOSTLY_KNOWN * len(points)) else None
+    votes, frames = Votes(), 0
+    if doubt is not None and doubt.glance is not None:
+        votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
+    wrong = fault(points, tolerance, placed, frames % EVERY == 0)
+    return Sight(anchored, wrong, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
 
 
 class Placed(NamedTuple):
@@ -145,7 +175,7 @@ class Placed(NamedTuple):
     lengths: NDArray[np.float64]
 
 
-def _placed(voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
+def _placed(voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
     """Return where points (N, 3) in the sensor's frame lie in the map."""
     if not len(points):
         none = np.zeros(0, bool)
@@ -163,7 +193,7 @@ def _placed(voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tole
 
 
 def _on_surface(
-    voxel_map: VoxelMap, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
+    voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Return which points (..., 3) in the sensor's frame lie on a surface, give or take (...) metres along the ray."""
     step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
@@ -180,12 +210,26 @@ def _fault(
     placed: Placed,
     align: bool,
 ) -> str:
-    """Return the fault under which points (N, 3) would lie on the map's surfaces, "" if there is none.
+    """Return as `explained`; another pose is sought only if `align`, for it takes longest."""
+    pose = partial(pose_on_surfaces, voxel_map, image) if align else None
+    return explained(voxel_map, image.T_world_sensor, points, tolerance, placed.lengths, FAULTS, pose)
 
-    Tried are those of `FAULTS`, depths too large or too small by a factor or by some metres, and a sensor that stands
-    elsewhere; the last only if `align`, for it takes longest.
+
+def explained(
+    surfaces: Surfaces,
+    T: Transform,
+    points: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+    faults: Mapping[str, NDArray[np.float64]],
+    pose: Callable[[], Transform | None] | None,
+) -> str:
+    """Return the fault under which points (N, 3) of a sensor at T would lie on the map's surfaces, "" if there is none.
+
+    Tried are `faults`, depths too large or too small by a factor or by some metres (lengths: as in `Placed`), and a
+    sensor that stands elsewhere, at `pose`.
     """
-    points, tolerance, lengths = (_thinned(values, TRIED) for values in (points, tolerance, placed.lengths))
+    points, tolerance, lengths = (_thinned(values, TRIED) for values in (points, tolerance, lengths))
     found = np.isfinite(lengths) & (lengths > 0)
     if not found.any():
         return ""
@@ -193,20 +237,19 @@ def _fault(
     away = np.linalg.norm(points, axis=1)
     metres = float(np.median((lengths - 1)[found] * away[found]))
     tried = [
-        *(points @ matrix.T for matrix in FAULTS.values()),
+        *(points @ matrix.T for matrix in faults.values()),
         times * points,
         points * (1 + metres / away)[:, None],
     ]
-    names = [*FAULTS, f"its depths x {1 / times:.2g}", f"its depths {-metres:+.2g} m"]
-    T = image.T_world_sensor
-    shares = _on_surface(voxel_map, T, np.stack(tried), np.broadcast_to(tolerance, (len(tried), len(points)))).mean(1)
-    as_it_is = float(_on_surface(voxel_map, T, points, tolerance).mean())
+    names = [*faults, f"its depths x {1 / times:.2g}", f"its depths {-metres:+.2g} m"]
+    shares = _on_surface(surfaces, T, np.stack(tried), np.broadcast_to(tolerance, (len(tried), len(points)))).mean(1)
+    as_it_is = float(_on_surface(surfaces, T, points, tolerance).mean())
     enough = as_it_is + max(EXPLAINED * (1 - as_it_is), GAIN)
     best = int(shares.argmax())
     if shares[best] >= enough:
         return "moved" if " about " in names[best] else names[best]
-    pose = pose_on_surfaces(voxel_map, image) if align else None
-    if pose is not None and _on_surface(voxel_map, pose, points, tolerance).mean() >= enough:
+    elsewhere = pose() if pose is not None else None
+    if elsewhere is not None and _on_surface(surfaces, elsewhere, points, tolerance).mean() >= enough:
         return "moved"
     return ""
 

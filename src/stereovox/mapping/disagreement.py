@@ -217,7 +217,7 @@ class DisagreementMonitor:
         return CONTRADICTS if self._lasted(doubt, self._changed_ns) else DISAGREES
 
     def _refusal(
-        self, frame: AnyFrame, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
+        self, frame: AnyFrame | Scan, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
     ) -> FrameRefused:
         detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
         if against is None:

@@ -63,7 +63,6 @@ SPACE = "evidence in space may come from any attitude"
 OWN_POSE = "its pose is the sensor's own"
 LIT = "it is no picture: where light is wrong, values are missing"
 BOUNDED = "the grid's work is bounded by `max_range`, which may span 4096 cells"
-NOT_COMPARED = "what moves in a plane leaves it as a whole; localisation has laid the scan onto the map"
 NO_PIXELS = "it has no pixels"
 BY_CAMERA = "the camera bounds its size"
 ANY_MAPPER = "both mappers take it"
@@ -156,11 +155,11 @@ CHECKS = (
           _cells(SPACE, SPACE, SPACE, "a lidar measures at one height", scan.check_heights, scan.check_heights),
           "scan.heights"),
     Check("disagrees_with_map", "more of it contradicts the map than is usual for its sensor",
-          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.max_disagreement, trust.pose_error_m"),
+          _cells(DisagreementMonitor.check), "trust.max_disagreement, trust.pose_error_m"),
     Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and what they show is no changed world",
-          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.changed_s"),
+          _cells(DisagreementMonitor.check), "trust.changed_s"),
     Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from elsewhere",
-          _cells(*[DisagreementMonitor.check] * 3, *[NOT_COMPARED] * 3), "trust.moved_s"),
+          _cells(DisagreementMonitor.check), "trust.moved_s"),
     Check("memory_full", "its cells do not fit into `max_memory`",
           _cells(CappedStorage.check_room, CappedStorage.check_room, CappedStorage.check_room, GridStorage.check_room,
                  GridStorage.check_room, GridStorage.check_room), "max_memory, when_full"),

@@ -101,8 +101,13 @@ class Gate:
         """Return the doubt that frames of its sensor are in, None if they agree."""
         return self._history.doubts.get(passed.sensor)
 
+    def others_apart(self, passed: GateResult, metres: float) -> bool:
+        """Return whether trusted frames of another sensor were taken higher or lower by more than so many metres."""
+        trusted, height = self._history.trusted, passed.seen.pose[11]
+        return any(abs(one.pose[11] - height) > metres for name, one in trusted.items() if name != passed.sensor)
+
     def check_agreement(
-        self, frame: AnyFrame, passed: GateResult, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan, passed: GateResult, against: float | None, sight: Sight | None
     ) -> GateResult:
         """Return what `accept` needs of a frame that was compared with the map.
 

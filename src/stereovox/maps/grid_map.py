@@ -24,6 +24,7 @@ from stereovox.maps.cells.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvide
 from stereovox.maps.files.lock import only_writer_of
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.query.queries import INDEX_LIMIT, points_of, shape_error
+from stereovox.maps.record.frame_agreement import BeamAgreement
 from stereovox.maps.record.history import History
 from stereovox.maps.storage.blocks import BlockPool
 from stereovox.maps.storage.memory import format_bytes
@@ -31,6 +32,8 @@ from stereovox.maps.storage.storage import OnStorage
 
 FORMAT, VERSION = "stereovox-grid", 2
 PARTS = ("about", "coords", "cells")
+BEAMS, DEEP_CELLS = 181, 4.0
+"""Most beams that a scan is judged by, and cells from a surface that a beam passes to where it ends."""
 MAX_PICTURED = 2**29
 """Cells of the largest picture; the map itself stores only known tiles and may extend farther."""
 
@@ -53,6 +56,9 @@ class GridStorage(Guarded):
         self.rules = CellRules(config.map.model_copy(update={"prior": config.grid.prior}))
         self.cell_format = self.rules.format
         self._most_rise = self.rules.most_rise
+        unknown, (free, _, occupied) = self.cell_format.unknown, map(np.int32, self.rules.sure)
+        self._surface = np.int32(max(self.rules.prior, self.rules.thresholds.free_most, unknown) + 1)
+        self._sure, self._counts = (np.int32(unknown), (self._surface, free), occupied), np.zeros(4, np.int64)
         self._pool = BlockPool(self.cell_format.dtype, capacity=64, fill=self.cell_format.unknown, cells=CELLS)
 
     def continue_with(self, config: Config) -> None:
@@ -89,6 +95,40 @@ class GridStorage(Guarded):
                 f"the grid would need {format_bytes(3 * needed)}, "
                 f"more than max_memory {format_bytes(self.config.max_memory)}; allow more or use larger cells",
             )
+
+    def agreement(self, evidence: GridEvidence, around: int) -> BeamAgreement:
+        """Return how a scan agrees with what is surely known; `around`: cells from a surface that are on it."""
+        if evidence.ends is None:
+            return BeamAgreement(0, 0, 0, 0)
+        pool, ends, counts = self._pool, evidence.ends, self._counts
+        step = -(-len(ends) // BEAMS)
+        _grid.weigh(pool.table, pool.coords, pool.values, *self._sure, around, DEEP_CELLS, ends, step, counts)
+        return BeamAgreement(*counts.tolist())
+
+    def seen_at(self, indices: NDArray[np.int64], around: int) -> NDArray[np.uint8]:
+        """Return OCCUPIED for cells, column and row (N, 2), up to `around` from a surface, FREE and UNKNOWN for others.
+
+        A surface is what is likelier than before the first evidence, and not free.
+        """
+        pool, found = self._pool, np.empty(len(indices), np.uint8)
+        limits = self._surface, self.rules.thresholds.free_most
+        unknown = np.int32(self.cell_format.unknown)
+        _grid.see(pool.table, pool.coords, pool.values, unknown, limits, indices, around, found)
+        return found
+
+    def cast(self, lines: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far (0 to 1) lines (N, 4), x, y to x, y in cells, run to an occupied cell; inf where none is."""
+        pool, found = self._pool, np.empty(len(lines))
+        _grid.cast(pool.table, pool.coords, pool.values, self.rules.thresholds.occupied_least, lines, found)
+        return found
+
+    def surfaces(self, left: int, bottom: int, rows: int, columns: int) -> NDArray[np.bool_]:
+        """Return which cells (rows, columns) from column `left` and row `bottom` on are surfaces, as for `seen_at`."""
+        picture, n = np.zeros((rows, columns), np.int8), len(self._pool)
+        lowest, highest = np.iinfo(self.cell_format.dtype).min, np.iinfo(self.cell_format.dtype).max
+        shown = (np.arange(lowest, highest + 1) >= self._surface).astype(np.int8)
+        _grid.show(self._pool.coords[:n], self._pool.values[:n], left, bottom, shown, int(lowest), picture)
+        return picture.view(bool)
 
     def add(self, evidence: GridEvidence) -> int:
         """Add the evidence of one scan (IST 2019, Eq 5); return the number of cells whose value changed."""

@@ -39,6 +39,7 @@ from stereovox.maps.files.lock import only_writer_of_floor
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_robot, parse_slice
+from stereovox.runs.pose_choice import NOT_COMPARED, uncompared
 from stereovox.runs.recording import (
     CHECKPOINT_S,
     Checkpoints,
@@ -263,6 +264,12 @@ class FloorRun:
         return how, floor
 
     def _make_mapper(self) -> GridMapper:
+        drifts = self._poses_from == ODOMETRY
+        if drifts or (self._floor is not None and self._resumed is None):
+            config, before = uncompared(self.config), self.config
+            why = "poses of odometry drift" if drifts else "poses in a map are off by more than a cell at times"
+            self._notify_unless_empty("" if config is before else f"note: {NOT_COMPARED.format(why=why)}")
+            self.config = config
         if self._resumed is None:
             return GridMapper(self.config)
         before = self._floor

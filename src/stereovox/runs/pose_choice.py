@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stereovox import opening
+from stereovox.config import Config, load_config
+from stereovox.config.safety import TrustConfig
 from stereovox.errors import NoPoses, StereovoxError, did_you_mean
 from stereovox.sources.base import Stream
 from stereovox.track.tracker import POSE_FAULTS
@@ -17,6 +19,7 @@ GIVEN, TRACK, BOTH = "given", "track", "both"
 CHOICES = (GIVEN, TRACK, BOTH)
 HOW = {TRACK: "tracked", BOTH: "corrected"}
 """How poses come about that a recording does not have, behind its name."""
+NOT_COMPARED = "scans are not compared with the map, since {why}; trust.max_disagreement=0.2 compares them"
 LOOKED_AT = 10
 """Frames, spread over a recording, of which one must have a pose, or it has none."""
 
@@ -27,6 +30,16 @@ class Choice(NamedTuple):
     source: Stream
     poses: str
     why: str = ""
+
+
+def uncompared(config: Config) -> Config:
+    """Return settings for scans at poses that drift, or that jump where a loop is closed: nothing is compared.
+
+    The same settings where the user has set `trust.max_disagreement`.
+    """
+    if config.trust.max_disagreement != TrustConfig().max_disagreement:
+        return config
+    return load_config(config, **{"trust.max_disagreement": 1})
 
 
 def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | None) -> Choice:

@@ -166,10 +166,16 @@ def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping
     from stereovox.ros.options import SLAM
     from stereovox.ros.poses.corrections import check_corrections
     from stereovox.ros.services import check_continuable
-    from stereovox.runs.pose_choice import TRACK
+    from stereovox.runs.pose_choice import NOT_COMPARED, TRACK, uncompared
     from stereovox.runs.warm_up import warm_up
 
     config, options = _settings(arguments, node)
+    if config.dimensions == 2 and options.localised and not arguments.load:
+        trusting = uncompared(config)
+        why = "SLAM and localisation correct the robot's pose by more than a cell at times"
+        if trusting is not config:
+            node.get_logger().info(NOT_COMPARED.format(why=why))
+        config = trusting
     options.check_sources()
     check_corrections(options, config)
     _reserve(options.out, config.dimensions, stack)

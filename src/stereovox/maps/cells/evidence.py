@@ -20,10 +20,13 @@ class GridEvidence:
     coords: (n, 3) int32 tile coordinates x, y, 0: tile (0, 0) holds cells 0..63 on both axes.
     values: (n, 4096) int16 or int32; cell (column, row) of a tile is at `64 row + column`. Zero if the scan says
         nothing.
+    ends: (N, 6) of each beam of the scan from where and up to where it clears, and where it hits, x and y in cells of
+        the grid; NaN for nothing. None where it is not known.
     """
 
     coords: NDArray[np.int32]
     values: NDArray[np.signedinteger]
+    ends: NDArray[np.float64] | None = None
 
     @classmethod
     def nothing(cls) -> GridEvidence:

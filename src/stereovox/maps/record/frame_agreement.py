@@ -16,6 +16,8 @@ from stereovox.maps.storage.blocks import StoredCells
 
 FEW = 200.0
 """Log-odds on surfaces the map is sure of that are too few to judge a frame by: some 50 hits."""
+FEW_BEAMS, AGAINST_BEAMS = 12, 8
+"""Beams of a scan that are; and those against the map that are enough wherever they come from."""
 KNOWN = 0.3
 """Share of what a frame sees that the map must be sure of."""
 SAMPLE = 512
@@ -68,6 +70,30 @@ class Agreement(NamedTuple):
         within = self.through + self.into_free - self.at_edge
         against = within + min(self.at_edge, within)
         return against / (self.hits + against) if against else 0.0
+
+
+class BeamAgreement(NamedTuple):
+    """How many beams of a scan agree with what a grid is sure of.
+
+    agree: end at a surface. into_free: end in what is surely free. through: clear what is surely occupied, and end at
+    nothing known. every: all that say something.
+    """
+
+    agree: int
+    into_free: int
+    through: int
+    every: int
+
+    @property
+    def against(self) -> float | None:
+        """Share of beams that are against the grid, of those it knows something of; None if they are too few.
+
+        Where it knows little of what the scan sees, so many against it are enough to judge.
+        """
+        against = self.into_free + self.through
+        known = self.agree + against
+        judged = known >= FEW_BEAMS and (known >= KNOWN * self.every or against >= AGAINST_BEAMS)
+        return against / known if judged else None
 
 
 def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: int) -> Agreement:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which bad scans does a 2-D grid take in, how soon does it accept a changed world, and how many good scans are refused?
+"""Which bad scans does a 2-D grid take in, how soon a changed world, and how many good scans are refused?
 
     python benchmarks/bad_scans.py SOURCE [SOURCE ...] [--voxel-size 0.05] [--starts 6] [--last 1 4 20] [--young S]
                                    [--only good|faults|changes|cost] [--set key=value ...] [--json]
@@ -281,7 +281,7 @@ def _leaves(plan: FloorPlan) -> list[Any]:
 def _gaps(plan: FloorPlan) -> list[Any]:
     """Return openings of 1.2 m in the outer walls, with a room of 2 m behind."""
     gaps = []
-    for x0, y0, x1, y1 in plan.free:
+    for x0, y0, x1, _ in plan.free:
         if x1 - x0 > 5:
             x = x0 + 0.37 * (x1 - x0)
             gaps.append((x, y0 - 0.2, x + 1.2, y0))

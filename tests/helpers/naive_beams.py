@@ -39,7 +39,7 @@ def scan_cells(scan: Scan, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)) 
 
 
 def scan_beams(scan: Scan, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return from where and up to where each beam clears, and where it hits, (N, 6) in cells, as `GridEvidence.ends`."""
+    """Return from where to where each beam clears, and where it hits, (N, 6) in cells, as `GridEvidence.ends`."""
     rows = []
     for start, free, hit, _ in _beams(scan, config, origin):
         places = (start if free else None, free, hit)

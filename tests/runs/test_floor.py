@@ -77,7 +77,7 @@ def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
     settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "notify": told.append}
     made = sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(0, 0, 0))
     assert len(made.track.stamps_ns) == scans
-    assert told[0] == f"localising the robot in {tmp_path / 'a.yaml'}"
+    assert told[1] == f"localising the robot in {tmp_path / 'a.yaml'}"
     assert "of the beams end within" in told[-1]
     with pytest.raises(sv.StereovoxError, match=r"start 900, 0 m, 0 degrees: lies outside of the map"):
         sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(900, 0, 0))
@@ -128,7 +128,7 @@ def test_a_run_that_is_told_to_stop_is_saved(tmp_path, then):
     told = []
     with pytest.raises(KeyboardInterrupt):
         sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[Seen(5, then)], notify=told.append, checkpoint_s=0)
-    assert told == [f"stopped after 5 of 16 readings; they are saved in {tmp_path / 'a.yaml'}"]
+    assert told[1:] == [f"stopped after 5 of 16 readings; they are saved in {tmp_path / 'a.yaml'}"]
     sv.map_floor(DRIVE, tmp_path / "five.yaml", **LIDAR, frames=":5")
     same_cells(tmp_path / "a.yaml", tmp_path / "five.yaml")
 

@@ -127,11 +127,17 @@ class Surfaces(Protocol):
     """A map that points are looked up in, as `VoxelMap` has it; what is no surface is FREE or UNKNOWN."""
 
     @property
-    def voxel_size(self) -> float: ...
+    def voxel_size(self) -> float:
+        """Side of a cell in metres."""
+        ...
 
-    def state(self, points: ArrayLike) -> NDArray[np.uint8]: ...
+    def state(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Return the state at points (N, 3)."""
+        ...
 
-    def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits: ...
+    def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits:
+        """Return where rays (N, 3) stop."""
+        ...
 
 
 def sight(

@@ -140,6 +140,8 @@ class Plane:
 
     def pose_on_surfaces(self, T: Transform, points: NDArray[np.float64]) -> Transform | None:
         """Return the T_world_sensor near T from which most of some points (N, 3) lie on surfaces; None: it is T."""
+        if not len(points):
+            return None
         points = points[:: max(1, -(-len(points) // TRIED))]
         arms = np.stack([points @ rotation_matrix([0, 0, np.radians(deg)]).T for deg in SHIFT_TURN_DEG])
         cells = np.floor(self._cells((arms @ T[:3, :3].T + T[:3, 3]).reshape(-1, 3))).astype(int)

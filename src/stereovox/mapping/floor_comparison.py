@@ -146,7 +146,7 @@ class Plane:
         arms = np.stack([points @ rotation_matrix([0, 0, np.radians(deg)]).T for deg in SHIFT_TURN_DEG])
         cells = np.floor(self._cells((arms @ T[:3, :3].T + T[:3, 3]).reshape(-1, 3))).astype(int)
         here = np.floor(self._cells(T[None, :3, 3])).astype(int)
-        near = (np.abs(cells - here) <= FAR_CELLS).all(axis=1)
+        near = np.abs(cells - here).max(axis=1) <= FAR_CELLS
         step = 2 * self._around
         most = ceil(SHIFTED_M / self.voxel_size / step)
         shifts = step * np.arange(-most, most + 1)
@@ -159,7 +159,7 @@ class Plane:
         shares = (found & near.reshape(len(arms), -1)[..., None, None]).mean(axis=1)
         turn, up, across = np.unravel_index(shares.argmax(), shares.shape)
         there = T.copy()
-        there[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, np.radians(SHIFT_TURN_DEG[turn])])
+        there[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, float(np.radians(SHIFT_TURN_DEG[turn]))])
         there[:2, 3] += np.linalg.solve(self._to_cells[:, :2], [shifts[across], shifts[up]])
         return None if np.array_equal(there, T) else there
 

@@ -37,7 +37,7 @@ def uncompared(config: Config) -> Config:
 
     The same settings where the user has set `trust.max_disagreement`.
     """
-    if config.trust.max_disagreement != TrustConfig().max_disagreement:
+    if config.trust.max_disagreement != TrustConfig.model_fields["max_disagreement"].default:
         return config
     return load_config(config, **{"trust.max_disagreement": 1})
 

@@ -87,7 +87,7 @@ def words(figure):
 
 def test_both_ways_and_the_loops_are_where_they_are():
     closure = closure_of([(0, 8), (1, 7)], [(2, 6)])
-    axis = panel(loops_figure(closure, after_map(), before_map()), "way from above")
+    axis = panel(loops_figure(closure, after_map(), before_map()), "path from above")
     ways = {line.get_color(): line.get_xydata() for line in axis.lines if len(line.get_xydata()) == FRAMES}
     np.testing.assert_allclose(ways[BEFORE], closure.T_world_before[:, :2, 3])
     np.testing.assert_allclose(ways[AFTER], closure.T_world_sensor[:, :2, 3])
@@ -110,7 +110,7 @@ def test_it_looks_near_where_two_places_were_most_off():
         low, high = panel(figure, name).get_xlim()
         assert (low + high) / 2 == pytest.approx(0.0)
         assert high - low == pytest.approx(WINDOW_M + 2.0)
-    (box,) = panel(figure, "way from above").patches
+    (box,) = panel(figure, "path from above").patches
     assert box.get_width() == pytest.approx(WINDOW_M + 2.0)
 
 
@@ -125,7 +125,7 @@ def test_numbers_and_reasons_are_said():
     assert f"{WHY} (0, {LISTED})" in words(figure)
     assert f"{WHY} (0, {LISTED + 1})" not in words(figure)
     assert "and 2 more refused" in words(figure)
-    numbers = [text.get_text() for text in panel(figure, "way from above").texts]
+    numbers = [text.get_text() for text in panel(figure, "path from above").texts]
     assert numbers == [str(n) for n in range(1, LISTED + 1)]
 
 
@@ -134,7 +134,7 @@ def test_numbers_at_one_place_do_not_lie_on_each_other():
         closure_of([(0, 8)], [(0, 2), (1, 2), (3, 2), (4, 2), (5, 6), (7, 6)]), after_map(), before_map()
     )
     figure.draw_without_rendering()
-    discs = [text.get_bbox_patch().get_window_extent() for text in panel(figure, "way from above").texts]
+    discs = [text.get_bbox_patch().get_window_extent() for text in panel(figure, "path from above").texts]
     assert len(discs) == 6
     assert not any(one.overlaps(other) for one, other in combinations(discs, 2))
 
@@ -153,7 +153,7 @@ def test_the_map_before_may_be_left_out():
 
 def test_from_above_is_along_up():
     figure = loops_figure(closure_of([(0, 8)]), map_of([1.0], up="x"))
-    axis = panel(figure, "way from above")
+    axis = panel(figure, "path from above")
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("y [m]", "z [m]")
     np.testing.assert_allclose(segments(axis, CLOSED), [[[0, 0], [1, 0]]])
 

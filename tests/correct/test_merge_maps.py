@@ -158,7 +158,7 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
 
 
 def test_a_recording_that_kept_no_frames_is_not_sought():
-    with pytest.raises(StereovoxError, match="only by frames, and a map did not keep its frames"):
+    with pytest.raises(StereovoxError, match="only from frames, and a map did not keep its frames"):
         sv.join(mapped(frames()), mapped(frames(), **{"map.keep_frames": False}))
 
 
@@ -174,5 +174,5 @@ def test_recordings_of_which_one_came_after_the_other_are_one_way():
 def test_frames_that_have_one_stamp_are_no_way():
     repeated = [replace(frame, stamp_ns=7) for frame in frames(4)]
     voxel_map = mapped(repeated, **{"trust.ordered": False})
-    with pytest.raises(StereovoxError, match=r"frames of camera 0 have the stamp 7; loops are closed of frames"):
+    with pytest.raises(StereovoxError, match=r"frames of camera 0 have the stamp 7; loop closure needs frames"):
         check_one_way(voxel_map.history, voxel_map.kept_frames.frames)

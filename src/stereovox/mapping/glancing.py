@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +79,7 @@ class Looker:
 
     def __init__(self, config: Config):
         self._reach, self._least = FARTHEST * config.max_range, config.voxel_size
-        self._noise: PerCamera[RangeNoise] = PerCamera(lambda camera: RangeNoise.of(config.noise, camera))
+        self._noise = PerCamera(partial(RangeNoise.of, config.noise))
 
     def tolerance(self, camera: VirtualCamera | Lidar, metres: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return by how much (N,) distances from the sensor may be off the map."""

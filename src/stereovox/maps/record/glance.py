@@ -72,16 +72,16 @@ class Glance(NamedTuple):
         """
         T = np.reshape(self.pose, (3, 4))
         here = np.column_stack([T[:, :3].T @ T_world_sensor[:3, :3], T[:, :3].T @ (T_world_sensor[:3, 3] - T[:, 3])])
-        points, tolerance = np.ascontiguousarray(points, np.float32), np.asarray(tolerance, np.float32)
+        there, off = np.ascontiguousarray(points, np.float32), np.asarray(tolerance, np.float32)
         found = np.empty((2, len(points)), np.uint8)
         for motion, out in zip((here.astype(np.float32), AT_REST), found, strict=True):
-            place(_metres(self.ranges), points, motion, tolerance, out)
+            place(_metres(self.ranges), there, motion, off, out)
         in_view, (in_world, in_sensor) = found[0] != UNSEEN, found == SAME
         return Votes(
-            np.count_nonzero(in_world & ~in_sensor),
-            np.count_nonzero(in_view & in_sensor & ~in_world),
-            np.count_nonzero(in_view & ~(in_sensor | in_world)),
-            np.count_nonzero(in_world & in_sensor),
+            int(np.count_nonzero(in_world & ~in_sensor)),
+            int(np.count_nonzero(in_view & in_sensor & ~in_world)),
+            int(np.count_nonzero(in_view & ~(in_sensor | in_world))),
+            int(np.count_nonzero(in_world & in_sensor)),
         )
 
 

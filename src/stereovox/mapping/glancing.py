@@ -36,16 +36,16 @@ NEAR, NEAR_TURN = 0.3, 0.4
 ENOUGH, FEW = 100, 20
 """Points of the glances that must be in view to say something, and that must be in the sensor alone."""
 REPEATED = 0.9
-"""Share of the points of a glance that must be where they were in the sensor for an image to repeat it."""
+"""Share of the points of a glance that must be unmoved in the sensor for an image to repeat it."""
 FROZEN = 1.5
-"""How many times more points are where they were in the sensor than in the world if what it shows is old."""
+"""How many times more points are unmoved in the sensor than in the world if what it shows is old."""
 
 
 class Lately(NamedTuple):
     """What glances at what a sensor saw lately say of a frame.
 
     seen: how many of their points it sees something in the direction of. through: how many it looks through. world,
-    sensor: how many are where they were in the world alone, or in the sensor alone, as if it had not moved; of glances
+    sensor: how many stayed in the world alone, or in the sensor alone, as if it had not moved; of glances
     from near by, since from afar many points are somewhere by chance.
     """
 
@@ -113,7 +113,7 @@ class Looker:
         )
 
     def repeats(self, glance: Glance | None, image: AnyImage, ranges: NDArray[np.float32]) -> bool:
-        """Return whether an image from elsewhere shows what a glance saw: everything is where it was in the sensor."""
+        """Return whether an image from elsewhere shows what a glance saw: everything is unmoved in the sensor."""
         if glance is None or not _is_elsewhere(glance, image.T_world_sensor):
             return False
         found = self._found(ranges, image.camera, marks_of(glance).sensor)

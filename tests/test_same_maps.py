@@ -120,8 +120,8 @@ def mapped(source: str | Path, frames: str, **settings: Any) -> Cells:
 
 
 def floor(robot: str | Path, what: str, step: int, most: int, **settings: Any) -> Cells:
-    """Return the cells of a floor by the robot's `scans` or `frames`, along its odometry."""
-    mapper = sv.GridMapper(**settings)
+    """Return the cells of a floor by the robot's `scans` or `frames`, along its odometry, which drifts."""
+    mapper = sv.GridMapper(**{"trust.max_disagreement": 1.0, **settings})
     for seen in islice(getattr(open_robot(robot), what), 0, most * step, step):
         mapper.add(seen)
     return cells_of(mapper.map)

@@ -417,7 +417,7 @@ def test_what_does_not_go_together():
         together(a, random_map(up="-y"), motion([np.pi / 2, 0, 0], [0, 0, 0]))
         with pytest.raises(StereovoxError, match="rigid"):
             together(a, a, np.diag([2.0, 1, 1, 1]))
-        with pytest.raises(StereovoxError, match="farther"):
+        with pytest.raises(StereovoxError, match="beyond the range of cell indices"):
             together(a, a, motion([0, 0, 0], [0, 1e12, 0]))
     assert table(sv.merge(sv.coarsen(a, 2), other)).keys() == table(sv.coarsen(a, 2)).keys() | table(other).keys()
     assert not len(sv.crop(VoxelMap(a.config), [0, 0, 0], [1, 1, 1]).cells()[0])

@@ -178,7 +178,7 @@ MISTAKES = [
     ("did you mean 'stereo'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "sensor.model=stero"]),
     ("unknown profile", ["map", "{rec}", "--out", "{tmp}/m", "--profile", "chien"]),
     ("is not a slice", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "1-5"]),
-    ("picks none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
+    ("selects none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
     ("did you mean '--threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),

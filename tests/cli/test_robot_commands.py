@@ -208,7 +208,7 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
         (("slam", DRIVE, "--out", "a.yaml", "--relations", "nope"), "nope"),
         (("slam", DRIVE, "--out", "a.svox"), "give a name that ends in .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "poses gps: give slam, odometry, or the .yaml"),
-        (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "picks none"),
+        (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "selects none"),
         (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'grid.thickness'"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum"), "nowhere.yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--poses", "odometry", "--start", "0,0,0"), "says where in a map"),

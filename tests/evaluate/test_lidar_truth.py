@@ -165,7 +165,7 @@ def test_bad_values_are_one_line(tmp_path):
     for settings, says in [
         ({"free": "nothing"}, "free 'nothing'"),
         ({"box_margin": -1.0}, "box margin"),
-        ({"frames": "9:"}, "picks none of the 4"),
+        ({"frames": "9:"}, "selects none of the 4"),
     ]:
         with pytest.raises(StereovoxError, match=says):
             lidar_truth(source, SIZE, RANGE, **settings)

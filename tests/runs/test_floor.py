@@ -203,7 +203,7 @@ def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
         (DRIVE, tmp_path / "a.svox", {}, "give a name that ends in .yaml or .pgm or .png"),
         ("nowhere.bag", out, {}, "nowhere.bag: no such file"),
         (DRIVE, out, {"use": "sonar"}, "use 'sonar': give depth, lidar or both"),
-        (DRIVE, out, {"frames": "99:"}, "picks none of"),
+        (DRIVE, out, {"frames": "99:"}, "selects none of"),
         (DRIVE, out, {"poses": "gps"}, "poses gps: give slam, odometry, or the .yaml"),
         (DRIVE, out, {"poses": "odometry", "start": (0, 0, 0)}, "says where in a map"),
         (DRIVE, out, {"mode": "gray"}, "no mode 'gray'"),

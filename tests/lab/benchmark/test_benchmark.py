@@ -144,7 +144,7 @@ def test_every_tenth_frame_judges_the_map_of_the_others(monkeypatch):
     assert air[:, 0].max() < 4.15 - 2 * task.voxel_size - 0.02 * 4
     with pytest.raises(StereovoxError, match="give at least 10"):
         list(tasks_of("listed", frames=":5"))
-    with pytest.raises(SourceError, match="picks none"):
+    with pytest.raises(SourceError, match="selects none"):
         list(tasks_of("listed", frames="90:"))
 
 
@@ -295,7 +295,7 @@ def test_the_command_prints_a_table_and_writes_page_and_figures(tmp_path, capsys
     [
         (["nosuchfolder"], "nosuchfolder"),
         ([SMALL, "--libraries", "octopus"], "octopus"),
-        ([SMALL, "--libraries", "stereovox", "--frames", "9:"], "picks none"),
+        ([SMALL, "--libraries", "stereovox", "--frames", "9:"], "selects none"),
         ([SMALL, "--libraries", "stereovox", "--voxel-size", "-1"], "voxel_size"),
         ([SMALL, "--libraries", "stereovox", "--most-frames", "0"], "most-frames"),
     ],

@@ -309,7 +309,7 @@ def _picked(source: LidarSource, frames: str | Iterable[int] | None) -> list[int
         return [range(len(source))[i] for i in frames]
     picked = list(range(len(source))[parse_slice(frames)])
     if not picked:
-        raise SourceError(f"frames '{frames}' picks none of the {len(source)} frames of {source.name}; widen it")
+        raise SourceError(f"frames '{frames}' selects none of the {len(source)} frames of {source.name}; widen it")
     return picked
 
 

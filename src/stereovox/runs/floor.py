@@ -239,7 +239,7 @@ class FloorRun:
             raise StereovoxError(f"{robot.name}: holds no {what}; use {other}")
         picked = {name: range(len(readings))[parse_slice(self._frames or ":")] for name, readings in selected.items()}
         if not all(picked.values()):
-            raise StereovoxError(f"frames '{self._frames}' picks none of {robot.name}; widen it")
+            raise StereovoxError(f"frames '{self._frames}' selects none of {robot.name}; widen it")
         streams = [map(selected[name].__getitem__, numbers) for name, numbers in picked.items()]
         return in_time_order(*streams), sum(map(len, picked.values()))
 

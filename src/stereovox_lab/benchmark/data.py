@@ -167,7 +167,7 @@ def _task(
 def _picked(total: int, name: str, frames: str | None, most: int) -> list[int]:
     picked = range(total) if frames is None else range(total)[parse_slice(frames)]
     if not picked:
-        raise SourceError(f"frames '{frames}' picks none of the {total} frames of {name}; widen it")
+        raise SourceError(f"frames '{frames}' selects none of the {total} frames of {name}; widen it")
     if most < 1:
         raise SourceError(f"most-frames {most}: give at least 1")
     chosen = np.unique(np.linspace(0, len(picked) - 1, most).round().astype(int))

@@ -45,7 +45,7 @@ def test_a_missing_folder(where):
 def test_a_file_is_no_recording(tmp_path):
     path = tmp_path / "frame-000000.depth.png"
     path.write_bytes(b"")
-    with pytest.raises(SourceError, match="is a file"):
+    with pytest.raises(SourceError, match="is a single image"):
         open_source(path)
 
 

@@ -53,7 +53,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "floor.yaml", "m"], "floor.yaml: is the map of a floor"),
         (["import", "room.ply", "m", "--voxel-size", "0"], "voxel_size"),
         (["import", "room.ply", "room.ply"], "room.ply"),
-        (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),
+        (["import", "room.ply", "m", "--topic", "/a"], "--topic does not apply"),
         (["import", "room.ply", "m.yaml"], "room.ply: holds a map in space"),
         (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map reports"),
         (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap has its own cell size"),

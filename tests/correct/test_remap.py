@@ -163,5 +163,5 @@ def test_a_map_without_frames_is_refused(tmp_path):
 
 def test_a_file_of_poses_that_is_not_there_is_said_to_be_none(tmp_path):
     mapped(frames(each=60)).save(tmp_path / "m")
-    with pytest.raises(sv.StereovoxError, match=r"none\.tum: No such file or directory; give a file you may read"):
+    with pytest.raises(sv.StereovoxError, match=r"none\.tum: No such file or directory; give a readable file"):
         sv.remap(tmp_path / "m", tmp_path / "none.tum", tmp_path / "n")

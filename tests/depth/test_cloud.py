@@ -200,7 +200,7 @@ def test_points_without_a_time_are_left_out():
 
 def test_times_must_be_one_for_each_point_and_poses_known():
     cloud, times = swept(10**8, 10)
-    with pytest.raises(FrameRefused, match="times of 10 points"):
+    with pytest.raises(FrameRefused, match="times for 10 points"):
         deskewed(cloud, times[:9], moving)
 
     def unknown(stamp_ns):

@@ -286,7 +286,7 @@ def test_bags_without_such_a_map(tmp_path, voxel_map):
 def test_options_and_endings_that_say_nothing(tmp_path):
     for path, more, what in (
         ("a.bt", {"voxel_size": 0.1}, "--voxel-size says nothing"),
-        ("a.ply", {"topic": "/a"}, "--topic says nothing"),
+        ("a.ply", {"topic": "/a"}, "--topic does not apply"),
         ("a.xzy", {}, r"did you mean '\.xyz'"),
         ("none.ply", {"voxel_size": 0.0}, "cannot be read"),
         ("none.npz", {}, "cannot be read"),

@@ -39,7 +39,7 @@ def test_without_poses_the_camera_is_tracked_and_why_is_said(tmp_path):
 def test_bad_poses_are_an_error_and_no_reason_to_track(tmp_path):
     where = unposed(tmp_path, 3, poses=True)
     (where / "groundtruth.txt").write_text("yesterday 0 0 0 0 0 0 1\n")
-    with pytest.raises(SourceError, match=r"groundtruth\.txt:1: 'yesterday' is no time"):
+    with pytest.raises(SourceError, match=r"groundtruth\.txt:1: 'yesterday' is not a time in seconds"):
         choose_poses(where, None, None)
 
 

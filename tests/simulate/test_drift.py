@@ -74,5 +74,5 @@ def test_optical_axes_drift_alike():
 
 @pytest.mark.parametrize("drift", [-0.1, 0.5])
 def test_drift_has_limits(drift):
-    with pytest.raises(SourceError, match=f"drift={drift:g} must lie between 0 and 0.2"):
+    with pytest.raises(SourceError, match=f"drift={drift:g} must be between 0 and 0.2"):
         open_source(f"sim:room?drift={drift}")

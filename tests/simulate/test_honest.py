@@ -190,7 +190,7 @@ def test_cameras_are_chosen_by_name():
     assert Simulation("sim:room?camera=simple").device == Simulation("sim:room").device == D435()
     with pytest.raises(SourceError, match=r"camera=d415 is unknown; use simple or d435 or kinect"):
         Simulation("sim:room?camera=d415")
-    with pytest.raises(SourceError, match=r"correlation=-0\.5 must lie between 0 and 5"):
+    with pytest.raises(SourceError, match=r"correlation=-0\.5 must be between 0 and 5"):
         Simulation("sim:room?correlation=-0.5")
 
 

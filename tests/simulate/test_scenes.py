@@ -76,13 +76,13 @@ def test_optical_axes_change_the_frame_and_nothing_else(scene):
         ("sim:boxx", r"sim:boxx: unknown scene 'boxx' \(did you mean 'box'\?\)"),
         ("sim:box?distanse=2", r"unknown parameter 'distanse' \(did you mean 'distance'\?\)"),
         ("sim:box?size=medium", "size=medium is unknown; use large or small"),
-        ("sim:box?distance=9", "distance=9 must lie between 0.2 and 3.78"),
+        ("sim:box?distance=9", "distance=9 must be between 0.2 and 3.78"),
         ("sim:box?y=1.1", "puts the box into the floor"),
-        ("sim:wall?tilt=80", "tilt=80 must lie between -25 and 25"),
+        ("sim:wall?tilt=80", "tilt=80 must be between -25 and 25"),
         ("sim:room?distance=2", "unknown parameter 'distance'"),
         ("sim:room?axes=xyz", "axes=xyz is unknown; use world or optical"),
-        ("sim:room?image_width=3", "image_width=3 must lie between 16 and 1920"),
-        ("sim:flight?length=1", "length=1 must lie between"),
+        ("sim:room?image_width=3", "image_width=3 must be between 16 and 1920"),
+        ("sim:flight?length=1", "length=1 must be between"),
     ],
 )
 def test_wrong_use_is_one_line(location, complaint):

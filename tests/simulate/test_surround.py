@@ -125,7 +125,7 @@ def test_one_pair_can_be_picked():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("pair=up", "pair=up is unknown"), ("scale=9", "scale=9 must lie"), ("pairs=front", "did you mean 'pair'")],
+    [("pair=up", "pair=up is unknown"), ("scale=9", "scale=9 must be"), ("pairs=front", "did you mean 'pair'")],
 )
 def test_slips_of_the_pen(text, message):
     with pytest.raises(SourceError, match=message):

@@ -212,7 +212,7 @@ def changed(**changes):
         (omni(), "cam1: omni-radtan is not supported .pinhole-radtan, pinhole-equidistant"),
         (changed(distortion_model="fov"), "pinhole-fov is not supported"),
         (changed(T_cn_cnm1=[[1]]), "cam1.T_cn_cnm1 must be 16 numbers"),
-        (changed(T_cn_cnm1=np.diag([2.0, 1, 1, 1]).tolist()), "no rigid motion"),
+        (changed(T_cn_cnm1=np.diag([2.0, 1, 1, 1]).tolist()), "not a rigid motion"),
         (changed(intrinsics=["a"]), "cam1.intrinsics must be 4 numbers"),
         (changed(resolution=None), "cam1.resolution must be 2 numbers"),
         (json.dumps({"cam0": 3}), "no cam1"),
@@ -220,8 +220,8 @@ def changed(**changes):
         (info(LEFT, "plumb_bob", np.eye(3), 0.0), "camera_info of one eye"),
         ("hello: world", "not a stereo calibration of a known kind"),
         ("- a", "holds no table"),
-        ("a: [1, 2", "no YAML"),
-        ("a: !!python/object:os.system x", "no YAML"),
+        ("a: [1, 2", "not valid YAML"),
+        ("a: !!python/object:os.system x", "not valid YAML"),
     ],
 )
 def test_each_mistake_is_one_line(tmp_path, text, said):

@@ -26,7 +26,7 @@ def readings(**other):
         ({"angular_rate": RATES[:5]}, "angular_rate has shape"),
         ({"specific_force": RATES[:, :2]}, "specific_force has shape"),
         ({"angular_rate": RATES * np.nan}, "finite rad/s"),
-        ({"T_sensor_imu": 2 * np.eye(4)}, "no rigid motion"),
+        ({"T_sensor_imu": 2 * np.eye(4)}, "not a rigid motion"),
     ],
 )
 def test_what_are_no_readings_is_said_in_one_line(other, said):
@@ -57,7 +57,7 @@ def test_files_are_sorted_and_what_is_no_reading_is_left_out():
     rates[0, 0] = np.nan
     found = in_order(STAMPS[order], rates, RATES[order], np.eye(4), "a")
     assert (found.stamps_ns // MS).tolist() == [0, 10, 20]
-    with pytest.raises(SourceError, match="a: holds 0 readings"):
+    with pytest.raises(SourceError, match="a: holds 0 usable readings"):
         in_order(STAMPS, RATES * np.nan, RATES, np.eye(4), "a")
 
 
@@ -95,7 +95,7 @@ def test_a_live_one_forgets_what_is_old_and_leaves_what_is_none():
     assert len(imu.between(0, 10**15)) == before
     with pytest.raises(StereovoxError, match="give 3 numbers"):
         imu.add_specific_force(10**15, (1, 2))
-    with pytest.raises(StereovoxError, match="no rigid motion"):
+    with pytest.raises(StereovoxError, match="not a rigid motion"):
         LiveImu(np.zeros((4, 4)))
 
 

@@ -43,7 +43,7 @@ def test_frames_that_cannot_be_used_have_a_fault(tmp_path):
     write_png(folder / "side/left/100000000.png", picture(0, (30, 36)))
     frames = list(open_source(folder))
     assert [frame.fault for frame in frames] == ["missing_file", "bad_shape", "no_pose", "no_pose"]
-    assert "100000000.png: 30x36 pixels, rig.toml says 48x36; correct width and height there" in frames[1].fault_detail
+    assert "100000000.png: 30x36 pixels, rig.toml has 48x36; correct width and height there" in frames[1].fault_detail
     assert "front/right/100000000.png" in frames[0].fault_detail
     assert "side/left/150000000.png" in frames[2].fault_detail
     assert frames[2].left.shape == (0, 0)

@@ -121,7 +121,7 @@ def test_each_mistake_is_one_line(tmp_path, text, said):
 def test_another_size_and_a_bad_scale(tmp_path):
     frame = open_source(scene(tmp_path, width=400)).frame(0)
     assert frame.fault == "bad_shape"
-    assert "160x120 pixels, calib.txt says 400x120" in frame.fault_detail
+    assert "160x120 pixels, calib.txt has 400x120" in frame.fault_detail
     for text in ("2", "x"):
         with pytest.raises(SourceError, match=f"scale={text} must be a number from 0.01 to 1"):
             open_source(f"{tmp_path}?scale={text}")

@@ -72,7 +72,7 @@ def test_content_counts_more_than_the_name(tmp_path):
 
 def test_a_database_of_something_else(tmp_path):
     sqlite3.connect(tmp_path / "a.db3").execute("CREATE TABLE people (name TEXT)").connection.commit()
-    with pytest.raises(SourceError, match=r"a\.db3: no such table: topics; no \.db3 recording"):
+    with pytest.raises(SourceError, match=r"a\.db3: no such table: topics; not a \.db3 recording"):
         open_source(tmp_path / "a.db3")
 
 

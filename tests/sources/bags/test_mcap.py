@@ -150,7 +150,7 @@ def test_messages_packed_by_themselves(tmp_path):
 
 def test_a_packing_that_nobody_knows(tmp_path):
     file = open_bag(mcap(tmp_path / "a.mcap", TYPES, spoken(), Style(packing="brotli")))
-    with pytest.raises(FrameRefused, match="packed with 'brotli', which is not known"):
+    with pytest.raises(FrameRefused, match="packed with 'brotli', which is unknown"):
         file.read("/a", 0)
 
 

@@ -101,7 +101,7 @@ def test_times_in_a_file_and_poses_between_which_is_interpolated(tmp_path):
     assert [frame.stamp_ns for frame in source] == [100_000_000_000, 100_050_000_000, 100_100_000_000]
     np.testing.assert_allclose(source.frame(0).T_world_sensor[:2, 3], [0.025, 0.05], atol=1e-6)
     (tmp_path / "times.txt").write_text("100.0\n100.05\n")
-    with pytest.raises(SourceError, match="has 2 times of 3 clouds"):
+    with pytest.raises(SourceError, match="has 2 times for 3 clouds"):
         sv.open_source(f"{tmp_path}?poses=way.tum")
 
 

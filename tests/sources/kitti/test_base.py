@@ -298,7 +298,7 @@ def test_without_labels_a_note_says_what_it_means(tmp_path):
         (made.raw, "../calib_velo_to_cam.txt", "R: 2 0 0 0 2 0 0 0 2\nT: 0 0 0\n", "R is not a rotation"),
         (made.raw, "image_00/timestamps.txt", None, "drive's own file"),
         (made.raw, "image_00/timestamps.txt", "", "holds no time"),
-        (made.raw, "image_00/timestamps.txt", "yesterday\n", "timestamps.txt:1: 'yesterday' is no time"),
+        (made.raw, "image_00/timestamps.txt", "yesterday\n", "timestamps.txt:1: 'yesterday' is not a time like"),
         (
             made.raw,
             "image_00/timestamps.txt",

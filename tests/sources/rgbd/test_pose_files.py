@@ -68,7 +68,7 @@ def test_open3ds_json_is_world_to_camera_and_column_by_column(tmp_path):
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"parameters": 3}', '{"parameters": [{"extrinsic": [1, 2]}]}', "1"])
 def test_other_json_is_refused(tmp_path, text):
     (tmp_path / "p.json").write_text(text)
-    with pytest.raises(SourceError, match=r"p\.json: no "):
+    with pytest.raises(SourceError, match=r"p\.json: not "):
         read_poses(tmp_path / "p.json")
 
 
@@ -84,7 +84,7 @@ def test_a_folder_is_read_by_the_numbers_in_names(tmp_path):
     np.testing.assert_allclose(chosen.at(3), posed()[0])
     assert reason(chosen, 1) == "no_pose"
     assert reason(chosen, 2) == "bad_pose_file"
-    with pytest.raises(SourceError, match="holds no pose"):
+    with pytest.raises(SourceError, match="holds no usable pose"):
         found.of([1, 2])
 
 

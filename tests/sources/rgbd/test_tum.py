@@ -78,7 +78,7 @@ def test_a_bad_line_of_the_list_names_file_and_line(tmp_path, line):
 def test_an_image_whose_name_is_no_time_is_an_error(tmp_path):
     folder = tum(tmp_path, STAMPS, STRAIGHT, listed=False)
     write_png(folder / "depth" / "first.png", depth_image(0))
-    with pytest.raises(SourceError, match=r"first\.png.*no time"):
+    with pytest.raises(SourceError, match=r"first\.png.*not a time"):
         TumRgbd(folder)
 
 

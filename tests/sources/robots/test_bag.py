@@ -325,7 +325,7 @@ def test_other_worlds_and_robots_than_the_usual_ones_are_told(tmp_path):
 
     robot = RobotBag(made(tmp_path / "a.bag", slam, scans))
     assert "no base_footprint or base_link in /tf: laser is used as the robot" in robot.notes[0]
-    assert "poses are those of laser in arena" in robot.notes[1]
+    assert "using poses of laser in arena" in robot.notes[1]
     np.testing.assert_allclose(robot.scans[1].T_world_sensor, planar_motion(*pose(1)), atol=1e-9)
     np.testing.assert_array_equal(robot.scans[1].T_base_sensor, np.eye(4))
 
@@ -445,7 +445,7 @@ def test_of_several_depth_topics_the_longest_counts(tmp_path):
         ("scan=/tf", r"/tf holds tf2_msgs/TFMessage; \?scan= needs sensor_msgs/LaserScan or"),
         ("odom=/scan", r"/scan holds sensor_msgs/LaserScan; \?odom= needs nav_msgs/Odometry"),
         ("truth=/nowhere", "no topic /nowhere"),
-        ("truth=/scan", "no poses"),
+        ("truth=/scan", "not poses"),
         ("depth=/scan", "not images"),
         ("base_frame=base_lnk", r"base_frame=base_lnk is in no transform \(did you mean 'base_link'\?\)"),
         ("odom_frame=odm", r"no frame 'odm' in it \(did you mean 'odom'\?\); correct \?odom_frame=odm"),

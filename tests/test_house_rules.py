@@ -21,14 +21,14 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 602,
-    "lines": 91_150,
+    "modules": 600,
+    "lines": 90_750,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 80,
     "lines of the laboratory": 11_500,
-    "words of README and docs": 52_500,
+    "words of README and docs": 52_300,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

@@ -10,8 +10,7 @@ import pytest
 import stereovox as sv
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
-from stereovox.mapping.disagreement import LOOKS, MAX_LIMIT, OLD, SPREADS, USUAL_AT_FIRST, DisagreementMonitor, Sight
-from stereovox.mapping.glancing import Lately
+from stereovox.mapping.disagreement import LOOKS, MAX_LIMIT, SPREADS, USUAL_AT_FIRST, DisagreementMonitor, Sight
 from stereovox.maps.record.glance import SIDE, Glance, Votes
 from stereovox.maps.record.history import MAX_SENSORS, DisagreementSpell, History, RunningMean, StampedPose
 
@@ -35,7 +34,6 @@ class Told:
     def __init__(self, sight=WORLD, **trust):
         self.config = load_config(voxel_size=0.1, **{f"trust.{name}": value for name, value in trust.items()})
         self.history, self.sight, self.asked, self.now = History(), sight, 0, 0
-        self.stays = False  # whether frames that agree with the map are as `sight` as well
 
     def __call__(self, *shares, ms=100, sensor="camera"):
         """Return what becomes of one frame after the other, `ms` apart: "", why it was refused, or "after ..."."""
@@ -48,8 +46,7 @@ class Told:
         doubted = monitor.in_doubt(sensor, self.now, against)
         self.asked += doubted
         try:
-            sight = self.sight if against is None or against > 0.05 or self.stays else AGREES
-            agreement = monitor.check(FRAME, sensor, self.now, against, sight if doubted else None)
+            agreement = monitor.check(FRAME, sensor, self.now, against, self.sight if doubted else None)
         except FrameRefused as refused:
             self.detail = str(refused)
             return refused.reason
@@ -230,43 +227,6 @@ def test_a_frame_nearly_all_of_which_is_where_it_was_ends_a_doubt_that_has_laste
     told.sight = AGREES
     assert told(None) == [""]
     assert told.history.doubts == {}
-
-
-IN_PART = WORLD._replace(anchored=0.85, fault="")
-LOOKS_THROUGH = AGREES._replace(lately=Lately(seen=200, through=100))
-OLD_SIGHT = AGREES._replace(lately=Lately(seen=200, world=10, sensor=60))
-
-
-@pytest.mark.parametrize("sight", [SCALED, IN_PART, LOOKS_THROUGH, OLD_SIGHT])
-def test_a_doubt_ends_by_what_a_frame_shows_and_not_by_a_share_alone(sight):
-    told = Told(sight)
-    told(*[0.03] * 30, 0.6)
-    told.stays = True
-    assert told(0.03) == [DISAGREES]
-    told.sight = AGREES
-    assert told(0.03) == [""]
-
-
-def test_little_is_known_and_a_doubt_can_end():
-    told = Told(WORLD._replace(anchored=None))
-    told(*[0.03] * 30, 0.6)
-    told.stays = True
-    assert told(0.03) == [""]
-
-
-def test_what_was_seen_lately_brings_a_frame_into_doubt():
-    told = Told()
-    monitor = DisagreementMonitor(told.config, told.history)
-    assert not monitor.in_doubt("camera", 0, 0.03, Lately(seen=200, through=10, world=60, sensor=10))
-    assert monitor.in_doubt("camera", 0, 0.03, LOOKS_THROUGH.lately)
-    assert monitor.in_doubt("camera", 0, None, OLD_SIGHT.lately)
-
-
-def test_the_glance_of_the_first_old_frame_is_kept():
-    old, first = WORLD._replace(fault=OLD), Glance.at(np.array([[0.5, 0.2, 2.0]]), 2 * np.eye(4))
-    assert old.kept(None) == GLANCE
-    assert old.kept(first) == first
-    assert WORLD.kept(first) == GLANCE
 
 
 def test_each_sensor_is_for_itself_and_there_are_so_many():

@@ -16,9 +16,8 @@ from stereovox.config import Config
 from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
-from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, OLD, Sight
+from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
 from stereovox.mapping.gate import Gate, GateResult
-from stereovox.mapping.glancing import BLUR, FARTHEST, Lately, Looker, kept
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.query.queries import RayHits
@@ -26,18 +25,24 @@ from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import DisagreementSpell
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.noise import RangeNoise
 
 SURFACES = (State.OCCUPIED, State.TENTATIVE)
 FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
-POINTS, TRIED = 500, 100
-"""Most points of a frame in doubt that are looked at in the map, and that faults are tried on."""
+GLANCED, POINTS, TRIED = 2000, 500, 100
+"""Most points of a frame in doubt that a glance keeps, that are looked at in the map, and that faults are tried on."""
+BLUR = 1.5
+"""Tolerance from glance to glance, as a multiple of that towards the map: both are noisy."""
 GAIN = 0.1
 """Share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
 """Cells from a surface that is seen through to what is seen behind it; a floor seen at a flat angle is thick."""
 REACH = 60.0
 """Metres along a ray within which the map's first surface is sought."""
+FARTHEST = 10
+"""Maximum ranges beyond which points do not count: a lidar may give any number, and the map ends somewhere."""
+
 MIRRORED = {
     "mirrored": (-1, 1, 1),
     "upside down": (1, -1, 1),
@@ -85,7 +90,7 @@ class Comparison:
     def __init__(self, config: Config, gate: Gate):
         self._gate, self._compares = gate, config.trust.max_disagreement < 1
         self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
-        self._looker = Looker(config)
+        self._noise = PerCamera(partial(RangeNoise.of, config.noise))
         self._prepared = False
 
     def check(
@@ -100,55 +105,22 @@ class Comparison:
             return passed
         self._prepare(voxel_map, image)
         against = voxel_map.storage.agreement(evidence, self._firm[image.camera]).against
-        T, ranges, glances = image.T_world_sensor, self._looker.ranges(image), self._gate.glances(passed)
-        lately = self._looker.lately(glances, image.camera, T, ranges)
         with voxel_map.lock:
-            sight = None
-            if self._gate.in_doubt(passed, against, lately):
-                sight = self._sight(image, self._gate.doubt(passed), voxel_map, ranges, lately)
-            passed = self._gate.check_agreement(frame, passed, against, sight)
-        return passed.keeping(kept(() if lately.contradicts else glances, T, ranges))
+            doubted = self._gate.in_doubt(passed, against)
+            sight = self._sight(image, self._gate.doubt(passed), voxel_map) if doubted else None
+            return self._gate.check_agreement(frame, passed, against, sight)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Look at the first image once, so that kernels compile then and not when a frame is in doubt."""
         if not self._prepared:
             self._prepared = True
-            ranges = self._looker.ranges(image)
-            glance = Glance.of(ranges, image.T_world_sensor)
-            lately = self._looker.lately([glance], image.camera, image.T_world_sensor, ranges)
-            self._sight(image, None, voxel_map, ranges, lately)
+            self._sight(image, None, voxel_map)
             pose_on_surfaces(voxel_map, image)
 
-    def _sight(
-        self,
-        image: AnyImage,
-        doubt: DisagreementSpell | None,
-        voxel_map: VoxelMap,
-        ranges: NDArray[np.float32],
-        lately: Lately,
-    ) -> Sight:
+    def _sight(self, image: AnyImage, doubt: DisagreementSpell | None, voxel_map: VoxelMap) -> Sight:
         """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
-        points = _sampled(image, POINTS, FARTHEST * voxel_map.config.max_range)
-        sigma = partial(self._looker.tolerance, image.camera)
-
-        def fault(points: NDArray[np.float64], tolerance: NDArray[np.float64], placed: Placed, align: bool) -> str:
-            if _is_in_steps(points, tolerance):
-                return "without its steps"
-            repeats = doubt is not None and self._looker.repeats(doubt.glance, image, ranges)
-            found = _fault(voxel_map, image, points, tolerance, placed, align)
-            return found or (OLD if lately.old or repeats else "")
-
-        found = sight(voxel_map, image.T_world_sensor, points, sigma, doubt, fault)
-        return found._replace(glance=Glance.of(ranges, image.T_world_sensor), lately=lately)
-
-
-def _is_in_steps(points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> bool:
-    """Return whether depths or distances of points (N, 3) are a few numbers that lie farther apart than noise."""
-    for values in (points[:, 2], np.linalg.norm(points, axis=1)):
-        steps = np.diff(np.unique(values.round(3)))
-        if FEW <= FEW * len(steps) <= len(points) and np.median(steps) > np.median(tolerance):
-            return True
-    return False
+        seen, sigma = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), self._noise[image.camera].sigma
+        return sight(voxel_map, image.T_world_sensor, seen, sigma, doubt, partial(_fault, voxel_map, image))
 
 
 class Surfaces(Protocol):
@@ -317,20 +289,15 @@ def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
         points = image.ends[image.hits]
         return _thinned(points[_near(points, reach)], most)
     step = max(1, round((image.depth_m.size / most) ** 0.5))
-    some = slice(step // 2, None, step)
-    depth = image.depth_m[some, some]
-    columns, rows = (rays[some] for rays in image.camera.rays())
-    points = np.empty((*depth.shape, 3))
-    with np.errstate(invalid="ignore"):  # an infinite depth along an axis
-        points[..., 0], points[..., 1:] = columns * depth, rows[:, None] * depth[..., None]
-    points = points.reshape(-1, 3)
+    rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
+    points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
     return points[_near(points, reach)]
 
 
 def _near(points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     """Return which points (..., 3) are finite, lie up to `reach` metres from the sensor, and not in it."""
     with np.errstate(over="ignore"):
-        away = np.sqrt(np.einsum("...i,...i->...", points, points))
+        away = np.linalg.norm(points, axis=-1)
     return (away > 0) & (away <= reach)
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Scan, name_of
-from stereovox.mapping.glancing import NOTHING_SEEN, Lately
 from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, DisagreementSpell, History, RunningMean
 
@@ -35,8 +34,6 @@ EXPLAINED = 0.4
 """Share of what does not agree that a fault must explain to be the cause."""
 MOSTLY_KNOWN, AGREES = 0.5, 0.95
 """Shares of a frame's points that must be known, and of these that must agree, for a doubt that has lasted to end."""
-ENDS = 0.9
-"""Share of a frame's points on what is known that must agree for it to end a doubt."""
 FEW = 20
 """Points that are too few to judge by."""
 TELLING = 0.2
@@ -46,14 +43,11 @@ WORLDLY = 0.6
 LOOKS = 3
 """Looks in a row, each from another pose, at which a changed world must have stayed where it is."""
 PARTLY = "less than half of what it sees of the known is where it was: another place, or a fault"
-OLD = "old"
-"""The fault of a frame that shows what was seen from elsewhere."""
 CURES = {
     "moved": "it would agree from elsewhere; calibrate where the sensor is, or reset the tracker",
     "unanchored": f"{PARTLY}; check the sensor, or start a new map",
     "still": "move the sensor: at rest a fault cannot be told from a world that has changed",
     "fixed": "what contradicts the map moves with the sensor; clean it, or restart it",
-    OLD: "it shows what was seen from elsewhere; restart the sensor",
     "restless": "what contradicts the map is nowhere twice; check the sensor, or wait",
     "": "it is looked at from more places",
 }
@@ -66,8 +60,7 @@ class Sight(NamedTuple):
     anchored: share of its points on what is known that agree with the map; None if less than MOSTLY_KNOWN of all
     are. fault: the fault under which it would agree, "" if there is none. against: how many points contradict the
     map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
-    the glance before says of both. glance: what it sees itself. lately: what the glances of frames that were accepted
-    say of it.
+    the glance before says of both. glance: what it sees itself.
     """
 
     anchored: float | None
@@ -76,22 +69,11 @@ class Sight(NamedTuple):
     behind: int
     votes: Votes
     glance: Glance
-    lately: Lately = NOTHING_SEEN
-
-    @property
-    def clear(self) -> bool:
-        """Whether nothing but the map may be against it."""
-        return not self.fault and not self.lately.contradicts
-
-    @property
-    def ends(self) -> bool:
-        """Whether it may end a doubt: what it sees of the known is there, as far as much of it is known."""
-        return self.anchored is None or self.anchored >= ENDS
 
     @property
     def agrees(self) -> bool:
         """Whether it ends a doubt that has lasted: it sees much of the known, and nearly all of that is there."""
-        return (self.anchored or 0.0) >= AGREES and self.clear
+        return (self.anchored or 0.0) >= AGREES and not self.fault
 
     @property
     def told(self) -> int:
@@ -120,8 +102,6 @@ class Sight(NamedTuple):
 
     def kept(self, before: Glance | None) -> Glance:
         """Return the glance to compare the next frame with: a new one once there was enough to see from elsewhere."""
-        if self.fault == OLD and before is not None:
-            return before
         in_view = sum(self.votes) >= max(FEW, TELLING * self.against)
         return before if before is not None and in_view and not self.telling else self.glance
 
@@ -130,13 +110,12 @@ class Agreement(NamedTuple):
     """How an accepted frame agrees with the map.
 
     against: its disagreement, None if too little is known. doubt: the doubt that remains. after: the reason of the
-    refusals that this acceptance ends, "" if there were none. glances: what is kept of its sensor's.
+    refusals that this acceptance ends, "" if there were none.
     """
 
     against: float | None
     doubt: DisagreementSpell | None = None
     after: str = ""
-    glances: tuple[Glance, ...] = ()
 
 
 class DisagreementMonitor:
@@ -162,12 +141,12 @@ class DisagreementMonitor:
         share *= 1 + min(max(late_s / LATE_S, 0.0), 1.0)
         return min(mean + share * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
 
-    def in_doubt(self, sensor: str, stamp_ns: int, against: float | None, lately: Lately = NOTHING_SEEN) -> bool:
+    def in_doubt(self, sensor: str, stamp_ns: int, against: float | None) -> bool:
         """Return whether `check` needs a `Sight` of the frame."""
         doubt = self._history.doubts.get(sensor)
-        if lately.contradicts or (doubt is not None and doubt.verdict != CHANGED):
-            return True
-        return against is not None and not self._agrees(doubt, sensor, stamp_ns, against)
+        if against is None:
+            return doubt is not None and doubt.verdict != CHANGED
+        return not self._agrees(doubt, sensor, stamp_ns, against)
 
     def check(
         self, frame: AnyFrame | Scan, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
@@ -181,8 +160,6 @@ class DisagreementMonitor:
         before = self._history.doubts.get(sensor)
         if sight is None:
             return Agreement(against, before if against is None else None)
-        if sight.clear and sight.ends and against is not None and self._agrees(before, sensor, stamp_ns, against):
-            return Agreement(against)
         limit = self.limit(sensor, stamp_ns)
         doubt = DisagreementSpell(stamp_ns, stamp_ns) if before is None else before.going_on(stamp_ns)
         if sight.agrees and self._lasted(doubt, self._changed_ns):
@@ -197,8 +174,6 @@ class DisagreementMonitor:
 
     def accept(self, sensor: str, agreement: Agreement) -> None:
         """Remember a frame that the map took in."""
-        if agreement.glances:  # grids have none
-            self._history.glances[sensor] = agreement.glances
         if agreement.doubt is not None:
             self._remember(sensor, agreement.doubt)
         elif agreement.against is not None:
@@ -245,10 +220,7 @@ class DisagreementMonitor:
         self, frame: AnyFrame | Scan, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
     ) -> FrameRefused:
         detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
-        lately = sight.lately
-        if lately.looks_through:
-            detail = f"it looks through {lately.through / lately.seen:.0%} of what was seen just before"
-        elif against is None:
+        if against is None:
             detail = "nothing that it sees is known, and frames just before it disagree with the map"
         outcome = "moved" if doubt.verdict == MOVED else sight.outcome
         cure = CURES.get(outcome, f"it would agree if it were {outcome}; check driver, units and calibration")

@@ -17,8 +17,6 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
-from stereovox.mapping.glancing import NOTHING_SEEN, Lately
-from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.history import (
     MAX_NAME_LENGTH,
     MAX_SENSORS,
@@ -55,10 +53,6 @@ class GateResult(NamedTuple):
     after: str = ""
     look: ImageFingerprint | None = None
     agreement: Agreement | None = None
-
-    def keeping(self, glances: tuple[Glance, ...]) -> GateResult:
-        """Return it with the glances that are kept once it is accepted."""
-        return self if self.agreement is None else self._replace(agreement=self.agreement._replace(glances=glances))
 
     @property
     def note(self) -> str:
@@ -97,16 +91,11 @@ class Gate:
         passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
         if passed.after:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
-            self._history.glances.pop(sensor, None)
         return passed
 
-    def in_doubt(self, passed: GateResult, against: float | None, lately: Lately = NOTHING_SEEN) -> bool:
+    def in_doubt(self, passed: GateResult, against: float | None) -> bool:
         """Return as `DisagreementMonitor.in_doubt`."""
-        return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against, lately)
-
-    def glances(self, passed: GateResult) -> tuple[Glance, ...]:
-        """Return what its sensor saw lately."""
-        return self._history.glances.get(passed.sensor, ())
+        return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
 
     def doubt(self, passed: GateResult) -> DisagreementSpell | None:
         """Return the doubt that frames of its sensor are in, None if they agree."""

@@ -132,7 +132,7 @@ def test_an_image_whose_size_overflows_is_refused(tmp_path, capsys):
 def test_a_scan_of_infinities_marks_nothing(tmp_path, capsys):
     """depthimage_to_laserscan#91 (+Inf passes into the scan): what each of them means is reported and marks nothing.
 
-    +inf, and what is beyond range_max (Hokuyo writes range_max + 1 for "no echo"), is free; all others say nothing.
+    +inf is free; what is beyond range_max is discarded (LaserScan.msg), and all others say nothing.
     """
 
     def messages(bag):
@@ -146,7 +146,7 @@ def test_a_scan_of_infinities_marks_nothing(tmp_path, capsys):
     _, _, floor = mapped(capsys, robot_bag(tmp_path, messages), tmp_path / "floor.yaml", "--max-range", 4)
     occupied = np.argwhere(floor.states == State.OCCUPIED)
     angle = -0.9 + 0.3 * np.arange(7)
-    for beam, free in enumerate((True, True, False, False, False, False, True)):
+    for beam, free in enumerate((True, True, False, False, False, False, False)):
         spot = floor.indices([[1.5 * np.cos(angle[beam]), 1.5 * np.sin(angle[beam])]])[0]
         inside = (spot >= 0).all() and (spot < floor.cells.shape).all()
         assert (inside and floor.states[tuple(spot)] == State.FREE) == free

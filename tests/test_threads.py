@@ -120,6 +120,10 @@ SPACE = {
 }
 FLOOR = {
     "add": (NO_SCAN,),
+    "agreement": (NO_SCAN, 1),
+    "seen_at": (np.zeros((1, 2), np.int64), 1),
+    "cast": (np.zeros((1, 4)),),
+    "surfaces": (0, 0, 2, 2),
     "check_room": (NO_SCAN,),
     "insert": (NO_BLOCKS, np.empty((0, 4096), np.int16)),
     "log_odds": ([[0.1, 0.2]],),

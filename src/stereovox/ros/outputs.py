@@ -154,16 +154,12 @@ class Outputs:
         A map without a known cell is one unknown cell: a `nav_msgs/OccupancyGrid` without cells clears nobody's copy.
         """
         self.changed(stamp_ns, frame_id)
-        try:
-            grid = self._mapping.grid()
-        except StereovoxError as error:
-            self._log_error(error)
-            grid = None
-        grid = grid or OccupancyGrid(np.full((1, 1), -1, np.int8), self._mapping.config.voxel_size)
+        grid = self._grid() or OccupancyGrid(np.full((1, 1), -1, np.int8), self._mapping.config.voxel_size)
         message = occupancy_message(grid, stamp_ns, frame_id)
         self._publishers.map.publish(message)
-        if self._mapping.config.dimensions == 3:
-            self._worker.submit(self._publishers.send, VoxelMap(self._mapping.config), stamp_ns, frame_id, True)
+        copy = self._mapping.snapshot()
+        if copy is not None:
+            self._busy = self._worker.submit(self._send_cells, copy, stamp_ns, frame_id, to_nobody=True)
         return message
 
     def corrected(self) -> None:
@@ -205,13 +201,17 @@ class Outputs:
         heard = self._publishers.map.get_subscription_count() > 0
         period = 1 / self._options.map_rate if heard else UNHEARD_S
         self._next_map = max(self._next_map, now - period) + period  # one frame may come early: camera rates vary
-        try:
-            grid = self._mapping.grid()
-        except StereovoxError as error:
-            self._log_error(error)
-            return
+        grid = self._grid()
         if grid is not None:
             self._publishers.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
+
+    def _grid(self) -> OccupancyGrid | None:
+        """Return the 2-D map; None if nothing is known, or if it cannot be made, which is logged."""
+        try:
+            return self._mapping.grid()
+        except StereovoxError as error:
+            self._log_error(error)
+            return None
 
     def _publish_cells(self, now: float) -> None:
         self._new_cloud, self._next_cloud = False, now + 1 / self._options.cloud_rate
@@ -219,9 +219,9 @@ class Outputs:
         if copy is not None:
             self._busy = self._worker.submit(self._send_cells, copy, self._stamp_ns, self._frame_id)
 
-    def _send_cells(self, copy: Callable[[], VoxelMap], stamp_ns: int, frame_id: str) -> None:
+    def _send_cells(self, copy: Callable[[], VoxelMap], stamp_ns: int, frame_id: str, to_nobody: bool = False) -> None:
         try:
-            self._publishers.send(copy(), stamp_ns, frame_id)
+            self._publishers.send(copy(), stamp_ns, frame_id, to_nobody)
         except StereovoxError as error:
             self._log_error(error)
 

@@ -9,7 +9,7 @@ import pytest
 from stereovox import PoseSender, StereovoxError
 from stereovox.geometry.se3 import rotation_matrix, rotation_vector
 from stereovox.mavlink.link import dialect
-from stereovox.mavlink.pose_sender import POSE_MESSAGES, covariance_at, upper_triangle
+from stereovox.mavlink.pose_sender import POSE_MESSAGES, upper_triangle
 
 STEP_NS = 33_333_333
 NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -140,13 +140,6 @@ def test_what_is_not_known_of_the_covariance_is_said_with_nan():
     assert not np.isnan(upper_triangle(np.eye(6), level)).any()
     for covariance, angles in ((None, level), (np.full((6, 6), np.inf), level), (np.eye(6), (0.0, radians(90), 0.0))):
         assert np.isnan(upper_triangle(covariance, angles)[0])
-
-
-def test_covariance_of_another_point_of_the_body():
-    rng = np.random.default_rng(1)
-    errors, arm = rng.normal(size=(50, 6)), np.array([0.3, -0.2, 0.5])
-    elsewhere = np.hstack([errors[:, :3], errors[:, 3:] + np.cross(errors[:, :3], arm)])
-    np.testing.assert_allclose(covariance_at(errors.T @ errors, arm), elsewhere.T @ elsewhere, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("unknown", [np.full((4, 4), nan), REFLECTED, STRETCHED])

@@ -154,7 +154,7 @@ def sight(
     returns the name of what is wrong, by some of the points, their tolerances, how they lie, and whether there is time
     to seek another pose.
     """
-    points = _thinned(seen, POINTS)
+    points = thinned(seen, POINTS)
     tolerance = np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
     placed = _placed(surfaces, T, points, tolerance)
     against = placed.against
@@ -235,7 +235,7 @@ def explained(
     Tried are `faults`, depths too large or too small by a factor or by some metres (lengths: as in `Placed`), and a
     sensor that stands elsewhere, at `pose`.
     """
-    points, tolerance, lengths = (_thinned(values, TRIED) for values in (points, tolerance, lengths))
+    points, tolerance, lengths = (thinned(values, TRIED) for values in (points, tolerance, lengths))
     found = np.isfinite(lengths) & (lengths > 0)
     if not found.any():
         return ""
@@ -287,7 +287,7 @@ def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
     """Return some of the image's points (N, 3) up to `reach` metres from the sensor, in its frame, about `most`."""
     if isinstance(image, CheckedCloud):
         points = image.ends[image.hits]
-        return _thinned(points[_near(points, reach)], most)
+        return thinned(points[_near(points, reach)], most)
     step = max(1, round((image.depth_m.size / most) ** 0.5))
     rows, columns = (np.arange(step // 2, size, step) for size in image.depth_m.shape)
     points = _points(image, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
@@ -301,7 +301,7 @@ def _near(points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     return (away > 0) & (away <= reach)
 
 
-def _thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+def thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     """Return every n-th of values (N, ...), at most `most` of them."""
     return values[:: max(1, -(-len(values) // most))]
 
@@ -330,8 +330,8 @@ def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
     if len(points) < AROUND:
         return np.empty((0, 3)), np.empty((0, 3))
-    points = _thinned(points, DENSE)
-    some = _thinned(points, ALIGNED)
+    points = thinned(points, DENSE)
+    some = thinned(points, ALIGNED)
     _, near = KDTree(points).query(some, AROUND)
     arms = points[near] - points[near].mean(axis=1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", arms, arms))

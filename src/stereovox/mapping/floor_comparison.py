@@ -13,7 +13,7 @@ from stereovox.config import Config
 from stereovox.frame import AnyFrame, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import Transform, rotation_matrix
-from stereovox.mapping.comparison import GAIN, TRIED, Placed, explained, sight
+from stereovox.mapping.comparison import GAIN, TRIED, Placed, explained, sight, thinned
 from stereovox.mapping.disagreement import Sight
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps.cells.cell_format import State
@@ -142,7 +142,7 @@ class Plane:
         """Return the T_world_sensor near T from which most of some points (N, 3) lie on surfaces; None: it is T."""
         if not len(points):
             return None
-        points = points[:: max(1, -(-len(points) // TRIED))]
+        points = thinned(points, TRIED)
         arms = np.stack([points @ rotation_matrix([0, 0, np.radians(deg)]).T for deg in SHIFT_TURN_DEG])
         cells = np.floor(self._cells((arms @ T[:3, :3].T + T[:3, 3]).reshape(-1, 3))).astype(int)
         here = np.floor(self._cells(T[None, :3, 3])).astype(int)

@@ -229,14 +229,3 @@ def upper_triangle(covariance: ArrayLike | None, angles: tuple[float, float, flo
     change = np.zeros((6, 6))
     change[:3, 3:], change[3:, :3] = FRD, np.linalg.solve(by_rates, FRD)
     return (change @ found @ change.T)[np.triu_indices(6)].tolist()
-
-
-def covariance_at(covariance: NDArray[np.float64], arm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose, as for `PoseSender.pose`, of a point of the same body that is elsewhere.
-
-    arm: (3,) metres from the point that the covariance is of to the other one, along the world's axes.
-    """
-    x, y, z = arm
-    change = np.eye(6)
-    change[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-    return change @ covariance @ change.T

@@ -87,8 +87,7 @@ def find_scans(
     """
     if topic:
         check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
-        scans = ScanTopic(file, topic, range_max)
-        return scans, scans.notes
+        return ScanTopic(file, topic, range_max), ()
     found = _topics_of_type(file, LASER_SCAN)
     if not found:
         clouds = _topics_of_type(file, POINT_CLOUD)
@@ -99,8 +98,7 @@ def find_scans(
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
         note = (f"{file.path}: scans of {best}, which has the most; there are {others} too: add ?scan=/topic for them",)
-    scans = ScanTopic(file, best, range_max)
-    return scans, (*note, *scans.notes)
+    return ScanTopic(file, best, range_max), note
 
 
 def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:

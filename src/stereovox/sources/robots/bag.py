@@ -125,11 +125,12 @@ class RobotBag:
             raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {pixels}")
         limits = Limits(options.max_gap, options.extrapolate)
         chosen = FrameOptions(options.odom, options.base_frame, options.odom_frame, options.truth, limits)
-        scan_frame_id = self._scans.frame_id if self._scans else ""
+        scan_frame_id, range_notes = (self._scans.frame_id, self._scans.notes) if self._scans else ("", ())
         self.where = RobotFrames(file, chosen, (scan_frame_id, depth_frame_id))
         self._lidar, lidar_notes = self._mount_lidar(scan_frame_id)
         self._camera, camera_notes = self._mount_camera(depth_frame_id)
         self.truth: Poses | None = _truth(file, options.truth)
+        scan_notes = (*scan_notes, *range_notes)
         self.notes = (*file.notes, *scan_notes, *depth_notes, *self.where.notes, *lidar_notes, *camera_notes)
         self.scans: Sequence[Scan] = Lazy(self._scan, range(len(self._scans or ())))
         self.frames: Sequence[Frame] = Lazy(self._frame, range(len(self._depth or ())))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from stereovox.cli import command_module, commands
+from stereovox.cli import _Parser, command_module, commands  # pyright: ignore[reportPrivateUsage]
 
 Draw = Callable[[str], str]
 WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "export": 3}
@@ -105,7 +105,7 @@ def call(draw: Draw, dice: random.Random) -> list[str]:
 
 @cache
 def _parser(command: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=command, add_help=False)
+    parser = _Parser(prog=command, add_help=False)
     command_module(command).add_arguments(parser)
     parser.add_argument("--json", action="store_true")
     return parser

@@ -200,9 +200,9 @@ BAD = {
     "origin_text": ({"origin": "[1, 2, north]"}, "origin 'north' is not a number"),
     "thresholds": ({"free_thresh": "0.7"}, "must rise"),
     "mode": ({"mode": "binary"}, "mode 'binary'"),
-    "not_yaml": ({"image": "[\n}"}, "no YAML"),
-    "tag": ({"image": "!!python/object/apply:os.system [ls]"}, "no YAML"),
-    "deep": ({"image": "[" * 1500}, "no YAML"),
+    "not_yaml": ({"image": "[\n}"}, "not YAML"),
+    "tag": ({"image": "!!python/object/apply:os.system [ls]"}, "not YAML"),
+    "deep": ({"image": "[" * 1500}, "not YAML"),
 }
 
 

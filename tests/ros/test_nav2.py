@@ -164,7 +164,7 @@ def test_the_command_finds_the_distributions_file_or_says_what_to_give(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("[1, 2]", "holds no parameters"), ("a: [", "is no YAML"), (None, "cannot be read")]
+    ("text", "said"), [("[1, 2]", "holds no parameters"), ("a: [", "is not YAML"), (None, "cannot be read")]
 )
 def test_files_that_are_no_parameters_are_told(tmp_path, text, said):
     path = tmp_path / "p.yaml"

@@ -84,7 +84,7 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise StereovoxError(f"{path}: cannot be read ({error.strerror}); give a nav2_params.yaml") from None
     except ValueError as error:
-        raise StereovoxError(f"{path}: is no YAML ({error}); give a nav2_params.yaml") from None
+        raise StereovoxError(f"{path}: is not YAML ({error}); give a nav2_params.yaml") from None
     if not isinstance(found, dict) or not any(isinstance(one, dict) for one in found.values()):
         raise StereovoxError(f"{path}: holds no parameters of nodes; give a nav2_params.yaml")
     return found

@@ -137,8 +137,8 @@ def test_data_elsewhere(folder, data):
     [
         ([[1, 2, 3], [1, 2, 3]], "named twice"),
         ([[5, 0, 0], [1, 2, 3], [5, 0, 0]], "named twice"),
-        ([[0, 0, 0], [2**31 - 1, 0, 0]], "too far away"),
-        ([[0, 0, 0], [0, -(2**31), 0]], "too far away"),
+        ([[0, 0, 0], [2**31 - 1, 0, 0]], "out of range"),
+        ([[0, 0, 0], [0, -(2**31), 0]], "out of range"),
     ],
 )
 def test_blocks_that_cannot_be(folder, coords, said):

@@ -48,7 +48,7 @@ class Board:
 
 
 def find_corners(image: NDArray[np.uint8], board: Board) -> NDArray[np.float64] | None:
-    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None if there is none."""
+    """Return the (N, 2) pixels of the board's inner corners in a grey image, row by row; None if missing."""
     import cv2
 
     size = (board.columns, board.rows)

@@ -75,7 +75,7 @@ class Correlation:
 def add_products(products: NDArray[np.float64], errors: NDArray[np.floating]) -> None:
     """Add to `products` (2, LAGS + 1, 2), for each lag along rows and columns, the products' sum and number.
 
-    errors: (height, width), NaN if there is none.
+    errors: (height, width), NaN if missing.
     """
     known = np.isfinite(errors)
     values, there = np.where(known, errors, 0).astype(np.float32), known.astype(np.float32)

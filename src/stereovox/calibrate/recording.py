@@ -112,7 +112,7 @@ def read_wall(
 
 
 def metres(frame: Frame) -> NDArray[np.float32]:
-    """Return the depth as measured in metres, float32, NaN if there is none; poses and corrections are ignored."""
+    """Return the depth as measured in metres, float32, NaN if missing; poses and corrections are ignored."""
     raw = np.asarray(frame.depth)
     depth_m = raw.astype(np.float32) * np.float32(frame.depth_scale)
     usable = np.isfinite(depth_m) & (depth_m > 0)

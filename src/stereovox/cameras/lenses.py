@@ -153,7 +153,7 @@ class Lens:
         return np.where(np.abs(self._bent(angle) - radius) < 1e-9, angle, np.nan)
 
     def _undistorted(self, slopes: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the slopes x/z, y/z that appear at `plane`, by Newton's method; NaN if there are none."""
+        """Return the slopes x/z, y/z that appear at `plane`, by Newton's method; NaN if missing."""
         with np.errstate(all="ignore"):
             for _ in range(ROUNDS):
                 missing = plane - self._distorted(slopes)

@@ -172,7 +172,7 @@ class Placed(NamedTuple):
 
     agrees: on a surface. against: in what is known to be free, or behind an occupied cell and on no surface. behind:
     on a surface, seen through an occupied cell before it. lengths: how often the ray to a point fits between the
-    sensor and the map's first surface along it, inf if there is none.
+    sensor and the map's first surface along it, inf if missing.
     """
 
     agrees: NDArray[np.bool_]
@@ -230,7 +230,7 @@ def explained(
     faults: Mapping[str, NDArray[np.float64]],
     pose: Callable[[], Transform | None] | None,
 ) -> str:
-    """Return the fault under which points (N, 3) of a sensor at T would lie on the map's surfaces, "" if there is none.
+    """Return the fault under which points (N, 3) of a sensor at T would lie on the map's surfaces, "" if missing.
 
     Tried are `faults`, depths too large or too small by a factor or by some metres (lengths: as in `Placed`), and a
     sensor that stands elsewhere, at `pose`.

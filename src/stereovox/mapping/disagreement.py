@@ -58,7 +58,7 @@ class Sight(NamedTuple):
     """How a frame in doubt lies in the map, point by point.
 
     anchored: share of its points on what is known that agree with the map; None if less than MOSTLY_KNOWN of all
-    are. fault: the fault under which it would agree, "" if there is none. against: how many points contradict the
+    are. fault: the fault under which it would agree, "" if missing. against: how many points contradict the
     map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
     the glance before says of both. glance: what it sees itself.
     """

@@ -127,7 +127,7 @@ class Plane:
         return self._storage.seen_at(np.floor(self._cells(np.asarray(points))).astype(np.int64), self._around)
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits:
-        """Return the distance along rays (N, 3) of any length to the first occupied cell; infinity if there is none."""
+        """Return the distance along rays (N, 3) of any length to the first occupied cell; infinity if missing."""
         starts, ways = np.asarray(origins, float), np.asarray(directions, float)
         far = max_distance / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
         lines = np.column_stack([self._cells(starts), self._cells(starts + ways * far[:, None])])

@@ -197,7 +197,7 @@ class _Columns:
         self.own = np.hypot(x.mean(axis=0), y.mean(axis=0)) <= rules.own_radius
 
     def nearest(self, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the distance (72,) of the nearest chosen column in each sector, infinite if there is none."""
+        """Return the distance (72,) of the nearest chosen column in each sector, infinite if missing."""
         row, column = np.nonzero(chosen & self._within)
         away = self._away[row, column]
         first, last = self._reach(row, column)

@@ -209,7 +209,7 @@ def _as_kind(name: str, value: Any, default: Any) -> Any:
 
 
 def split_pair(text: str) -> tuple[str, str]:
-    """Split `TOPIC=OTHER` into both sides; the second is "" if there is none."""
+    """Split `TOPIC=OTHER` into both sides; the second is "" if missing."""
     first, _, second = text.partition("=")
     return first.strip(), second.strip()
 

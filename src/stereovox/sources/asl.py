@@ -141,7 +141,7 @@ class _Images:
 
 
 def _root(where: str) -> Path | None:
-    """Return the folder that contains the cameras, None if there is none."""
+    """Return the folder that contains the cameras, None if missing."""
     for root in (Path(where) / ROOT, Path(where)):
         for eye in EYES:
             if any(os.path.exists(root / eye / name) for name in (DATA, SENSOR, "data")):

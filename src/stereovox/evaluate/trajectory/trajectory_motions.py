@@ -73,7 +73,7 @@ def steps(found: Transforms, true: Transforms, start: NDArray[np.int64], end: ND
 
 
 def per_second(found: Transforms, true: Transforms, stamps_ns: NDArray[np.int64] | None) -> StepErrors | None:
-    """Return the errors of the motions from each pose to the one nearest to a second later; None if there is none.
+    """Return the errors of the motions from each pose to the one nearest to a second later; None if missing.
 
     stamps_ns: (N,) int64, ascending; None if unknown.
     """

@@ -75,6 +75,6 @@ def one_line(error: object) -> str:
 
 
 def cut_off(path: str) -> str:
-    """Return the file that a killed recorder left, empty if there is none."""
+    """Return the file that a killed recorder left, empty if missing."""
     pattern = f"{escape(path)}.*{UNFINISHED}/*/{escape(os.path.basename(path))}"
     return max(glob(pattern), default="", key=os.path.getmtime)

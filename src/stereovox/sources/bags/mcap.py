@@ -402,7 +402,7 @@ def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
 
 
 def _summary(file: McapBytes) -> tuple[int, bytes]:
-    """Return start and records of the summary of a whole file; raises ValueError if there is none."""
+    """Return start and records of the summary of a whole file; raises ValueError if missing."""
     tail = file.at(file.size - TAIL, file.size)
     if not tail.endswith(START):
         raise ValueError("the file is cut off")

@@ -115,7 +115,7 @@ def busiest_topic(file: BagFile, topics: list[str]) -> str:
 
 
 def frame_id_of(file: BagFile, topic: str) -> str:
-    """Return the frame in the header of the first readable message of a topic, "" if there is none."""
+    """Return the frame in the header of the first readable message of a topic, "" if missing."""
     for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return frame_name(file.read(topic, i).header()[1])
@@ -125,7 +125,7 @@ def frame_id_of(file: BagFile, topic: str) -> str:
 
 
 def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the topic with the robot's odometry, "" if there is none, and notes.
+    """Return the topic with the robot's odometry, "" if missing, and notes.
 
     given: preferred unless ""; other: a topic to ignore. Of several, the one with the most messages is used. Raises
     SourceError if the given one does not exist or is not odometry.

@@ -88,7 +88,7 @@ class BagWriter:
         self._file.sync()
 
     def leave(self) -> str:
-        """End a recording that cannot be completed; return the file with the messages so far, "" if there is none."""
+        """End a recording that cannot be completed; return the file with the messages so far, "" if missing."""
         return self._file.leave()
 
     def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:

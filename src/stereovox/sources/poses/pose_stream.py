@@ -43,7 +43,7 @@ class PoseStream:
         name: For messages.
         poses: The buffer that is filled.
         counts: Events: `bad` lines, `low_confidence`, `connections`.
-        trouble: The fault of the newest bad line, or of the connection; "" if there is none.
+        trouble: The fault of the newest bad line, or of the connection; "" if missing.
     """
 
     def __init__(self, name: str):

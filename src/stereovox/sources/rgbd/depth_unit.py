@@ -141,7 +141,7 @@ def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int],
 
 
 def _second(first: int, count: int, pose: Callable[[int], Transform]) -> int | None:
-    """Return the number of the next image taken far enough away, None if there is none."""
+    """Return the number of the next image taken far enough away, None if missing."""
     best, farthest = None, 0.1 * MOVED_M
     try:
         start = _numbers(pose(first))
@@ -208,7 +208,7 @@ def is_likely(pairs: Sequence[tuple[View, View]], unit: float) -> bool:
 
 
 def _middle(pairs: Sequence[tuple[View, View]], unit: float) -> float:
-    """Return the median depth in metres, NaN if there is none."""
+    """Return the median depth in metres, NaN if missing."""
     depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
     return float(np.median(np.concatenate(depths))) * unit if any(map(len, depths)) else np.nan
 

@@ -163,7 +163,7 @@ class DepthFolder(DepthSource, ABC):
         return None
 
     def numbers(self) -> list[int]:
-        """Return the numbers in the names of the image files; -1 if there is none."""
+        """Return the numbers in the names of the image files; -1 if missing."""
         return [number_in(image.path.name)[0] for image in self._images]
 
     def size(self) -> tuple[int, int]:
@@ -178,7 +178,7 @@ class DepthFolder(DepthSource, ABC):
         return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
 
     def list_photos(self) -> list[ImageFile]:
-        """Return pictures that the depth images are registered to, in any order; [] if there are none."""
+        """Return pictures that the depth images are registered to, in any order; [] if missing."""
         return []
 
     def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
@@ -243,13 +243,13 @@ class DepthFolder(DepthSource, ABC):
         return np.full((4, 4), np.nan) if self._poses is None else self._poses.at(self._images[i].stamp_ns)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused if there is none."""
+        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused if missing."""
         if not self.posed:
             return np.full((4, 4), np.nan)
         return self._reading.pose(self._pose_as_written(i))
 
     def _pose_as_written(self, i: int) -> Transform:
-        """Return the pose of frame `i` in a right-handed world; raises FrameRefused if there is none."""
+        """Return the pose of frame `i` in a right-handed world; raises FrameRefused if missing."""
         T = self.pose_in_file(i)
         return in_other_hand(T) if self._mirrored else T
 

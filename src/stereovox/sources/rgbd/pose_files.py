@@ -144,7 +144,7 @@ def in_other_hand(T: Transform) -> Transform:
 
 
 def number_in(name: str) -> tuple[int, str]:
-    """Return the last number in a file name, by which files are ordered, and the name; -1 if there is none."""
+    """Return the last number in a file name, by which files are ordered, and the name; -1 if missing."""
     found = re.findall(r"\d+", name.rpartition(".")[0] or name)
     return (int(found[-1]) if found else -1), name
 

@@ -119,7 +119,7 @@ class RobotFrames:
         return self.base, (f"{self.path}: {topic} has poses of {child}: assumed to be {self.base}",)
 
     def _named(self, name: str, option: str) -> str:
-        """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" if there is none."""
+        """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" if missing."""
         near = [frame for frame in self.tf.frames if frame.rpartition("/")[2] == name]
         near = [frame for frame in near if any(self.tf.connected(frame, other) for other in self._sensors)] or near
         if len(near) > 1 and name not in near:

@@ -189,7 +189,7 @@ class Colmap(DepthFolder):
 
 
 def model_folder(folder: str | os.PathLike[str], places: Sequence[str] = MODELS) -> Path | None:
-    """Return the first of `places` in a folder with cameras and images of a model, None if there is none."""
+    """Return the first of `places` in a folder with cameras and images of a model, None if missing."""
     for place in places:
         for suffix in (".bin", ".txt"):
             paths = [os.path.join(folder, place, f"{name}{suffix}") for name in ("cameras", "images")]

@@ -134,7 +134,7 @@ def _posed(where: str) -> bool:
 
 
 def _other_poses(folder: Path) -> Path | None:
-    """Return the file of a SLAM program whose lines look like stamped poses, None if there is none."""
+    """Return the file of a SLAM program whose lines look like stamped poses, None if missing."""
     paths = (path for pattern in OTHER_POSES for path in sorted(folder.glob(pattern)))
     return next((path for path in paths if _is_trajectory(path)), None)
 

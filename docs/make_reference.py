@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write pages of docs/reference from argparse, the settings and the tables of checks and outputs.
+"""Write docs/figures.md, and pages of docs/reference from argparse, the settings and the tables of checks and outputs.
 
     python docs/make_reference.py
 
@@ -9,6 +9,7 @@ A test compares the files with what is written here.
 from __future__ import annotations
 
 import re
+import runpy
 from argparse import SUPPRESS, Action, ArgumentParser
 from dataclasses import fields
 from pathlib import Path
@@ -118,6 +119,7 @@ def pages() -> dict[str, str]:
         "settings.md": _settings(),
         "refusals.md": _refusals(),
         "outputs.md": _outputs(),
+        "../figures.md": runpy.run_path(str(FOLDER.parents[1] / "benchmarks/results.py"))["page"](),
     }
 
 

@@ -33,7 +33,7 @@ from stereovox.cli import main
 from stereovox.mapper import Mapper
 from stereovox.maps import load_map, make_map
 from stereovox.opening import open_stream
-from stereovox.runs import recording
+from stereovox.runs import engine
 
 CONTEXT = get_context("fork")
 PLAIN: list[str] = []
@@ -50,8 +50,8 @@ def command(out: Path, given: Namespace, settings: list[str], *more: str) -> lis
 
 def perform(words: list[str], done: Any, saved: Any) -> None:
     """Run a command in this process; `done` and `saved` count the frames in the map and on disk for others."""
-    recording.REST = REST
-    add, save = Mapper.add, recording.Checkpoints.save
+    engine.REST = REST
+    add, save = Mapper.add, engine.Checkpoints.save
 
     def add_or_refuse(mapper: Mapper, frame: Any) -> Any:
         faulty = done.value % 7 == 3
@@ -59,11 +59,11 @@ def perform(words: list[str], done: Any, saved: Any) -> None:
         done.value += 1
         return report
 
-    def save_and_tell(self: recording.Checkpoints, frames: int) -> None:
+    def save_and_tell(self: engine.Checkpoints, frames: int) -> None:
         save(self, frames)
         saved.value = frames
 
-    Mapper.add, recording.Checkpoints.save = add_or_refuse, save_and_tell
+    Mapper.add, engine.Checkpoints.save = add_or_refuse, save_and_tell
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os._exit(main(words))

@@ -14,7 +14,7 @@ from house import circles_of, import_graphs, modules_of
 
 import stereovox
 from stereovox.mapper import GridMapper, Mapper
-from stereovox.runs.recording import Checkpoints
+from stereovox.runs.engine import Checkpoints
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LABORATORY = SOURCE.with_name("stereovox_lab")

@@ -23,6 +23,7 @@ from stereovox.sources.base import Part as Part
 from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
+from stereovox.sources.base import kind_of
 from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.foreign_files import cure_of
 from stereovox.sources.latest import LatestStream
@@ -176,8 +177,10 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
     kind = next((kind for kind in _classes() if kind.recognises(where)), None)
     if kind is None:
         source = _images_alone(where)
+    elif kind.composite:
+        source = _open(kind, where)
     else:
-        source = _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
+        source = kind.depth_only(where)
     return source if frames is None else Selection(source, frames)
 
 
@@ -226,7 +229,7 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
 def _depth_of(where: str) -> DepthSource:
     """Return the depth images of a recording that is not composite, or images alone."""
     for kind in _classes():
-        if not _is_composite(kind) and kind.recognises(where):
+        if not kind.composite and kind.recognises(where):
             return kind.depth_only(where)
     return _images_alone(where)
 
@@ -250,22 +253,18 @@ def _image_classes() -> tuple[Any, ...]:
 
 def _classes() -> Iterator[Any]:
     """Yield the classes of recordings one by one, so that only those needed are imported."""
-    return (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
+    return (kind_of(registry.find("sources", SOURCES, name)) for name in registry.names("sources", SOURCES))
 
 
 def _live_class(where: str) -> Any:
     """Return the class of the live camera that `where` names, None if it names none."""
-    kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
+    kinds = (kind_of(registry.find("streams", STREAMS, name)) for name in registry.names("streams", STREAMS))
     return next((kind for kind in kinds if kind.recognises(where)), None)
 
 
 def _open(kind: Any, where: str) -> Any:
     """Return the source of class `kind`; a composite one is handed what opens its parts."""
-    return kind(where, open_depth) if _is_composite(kind) else kind(where)
-
-
-def _is_composite(kind: Any) -> bool:
-    return getattr(kind, "composite", False)
+    return kind(where, open_depth) if kind.composite else kind(where)
 
 
 def _recognise(where: str) -> Any:
@@ -339,7 +338,7 @@ def _missing(folder: str, kinds: list[Any]) -> str:
     """Say what the nearest layout has in `folder` and what it lacks, with the cure; empty if none is near."""
     best, words = 0.0, ""
     for kind in kinds:
-        parts: tuple[Part, ...] = getattr(kind, "parts", ())
+        parts: tuple[Part, ...] = kind.parts
         counts = [part.count(folder) for part in parts]
         share = sum(map(bool, counts)) / max(len(parts), 1)
         near = bool(counts) and counts[0] > 0  # it has the images: poses alone may belong to anything

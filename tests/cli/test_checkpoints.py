@@ -16,8 +16,8 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.files.lock import only_writer_in, only_writer_of
-from stereovox.runs import recording
-from stereovox.runs.recording import REST, Checkpoints
+from stereovox.runs import engine, recording
+from stereovox.runs.engine import REST, Checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = "sim:room?image_width=64&frames=30"
@@ -104,7 +104,7 @@ def at_each_frame(monkeypatch, out, look):
         return add(self, frame)
 
     monkeypatch.setattr(Mapper, "add", looking)
-    monkeypatch.setattr("stereovox.runs.recording.REST", 0)
+    monkeypatch.setattr("stereovox.runs.engine.REST", 0)
     return ["--checkpoint", "1e-9"]
 
 
@@ -149,7 +149,7 @@ def test_refused_frames_do_not_take_the_place_of_an_older_map(tmp_path, monkeypa
 
 @pytest.mark.parametrize("seconds", ["0", "1e-9"])
 def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
-    monkeypatch.setattr("stereovox.runs.recording.REST", 0)
+    monkeypatch.setattr("stereovox.runs.engine.REST", 0)
     keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
     assert mapped(tmp_path / "a", *keep) == 0
     assert mapped(tmp_path / "b", *keep, "--checkpoint", seconds) == 0
@@ -360,7 +360,7 @@ def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.usefixtures("obeys_signals")
 def test_the_first_ctrl_c_waits_for_the_save_that_is_being_made():
-    with recording.interrupt_between_steps() as check:
+    with engine.interrupt_between_steps() as check:
         saved = []
         signal.raise_signal(signal.SIGINT)
         Checkpoints(lambda: saved.append(1), "m", 1.0).save(1)

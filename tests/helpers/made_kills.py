@@ -22,8 +22,8 @@ from stereovox.localize.track import Track
 from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.mapping import Mapping
-from stereovox.runs import recording
-from stereovox.runs.recording import Checkpoints
+from stereovox.runs import engine
+from stereovox.runs.engine import Checkpoints
 from stereovox.sources.poses.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=2&scan_hz=4&depth_hz=1&image_width=16"
@@ -187,5 +187,5 @@ def kill_at_steps(kind, folder, kills):
 
 
 if __name__ == "__main__":
-    recording.REST = 0
+    engine.REST = 0
     print(kill_at_steps(KINDS[sys.argv[1]], Path(sys.argv[2]), int(sys.argv[3])))

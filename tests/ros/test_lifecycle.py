@@ -142,14 +142,12 @@ def test_a_run_whose_cleanup_waits_is_not_replaced_but_ends(alone, monkeypatch):
 
     class Run:
         def __init__(self, _):
-            self.map_node = SimpleNamespace(active=True, spin_once=self.spin_once)
+            self.map_node = SimpleNamespace(active=True)
             made.append(self)
 
-        def spin_once(self):  # both calls come while messages are received
+        def step(self):  # both calls come while messages are received
             managed.cleanup()
             asked.append(managed.configure())
-
-        def step(self): ...
 
         def end(self):
             ended.append(self)
@@ -160,7 +158,7 @@ def test_a_run_whose_cleanup_waits_is_not_replaced_but_ends(alone, monkeypatch):
         node = rclpy.create_node("managed")
         managed = Managed(node, Run)
         assert managed.configure()
-        managed.spin_once()
+        managed._take(None)
         assert asked == [False]
         assert ended == made
         assert managed.configure()

@@ -116,7 +116,7 @@ def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone, when):
     monkeypatch.setenv("ROS_DOMAIN_ID", alone["ROS_DOMAIN_ID"])
     monkeypatch.setattr(MapNode, "spin_once", ends)
     monkeypatch.setattr(MapNode, when, breaks)
-    monkeypatch.setattr("stereovox.runs.warm_up.warm_up", lambda *_: None)
+    monkeypatch.setattr("stereovox.ros.run.warm_up", lambda *_: None)
     with pytest.raises(RuntimeError, match="foresaw"):
         main(["ros2", "--depth", DEPTH, "--odometry", "/odom", "--out", str(tmp_path / "live.svox")])
     assert load_map(tmp_path / "live.svox").frames == 1

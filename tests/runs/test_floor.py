@@ -21,8 +21,8 @@ from stereovox.localize.slam.pipeline import Slam
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import load_grid
 from stereovox.opening import open_robot
+from stereovox.runs import engine
 from stereovox.runs import floor as floor_run
-from stereovox.runs import recording
 
 DRIVE = "sim:floor?plan=testbed&seconds=4&scan_hz=4&depth_hz=2&image_width=64"
 LIDAR = {"use": "lidar", "poses": "odometry"}
@@ -136,7 +136,7 @@ def test_a_run_that_is_told_to_stop_is_saved(tmp_path, then):
 KILLED = f"""
 import os, signal, sys
 import stereovox as sv
-from stereovox.runs import recording
+from stereovox.runs import engine
 
 class Kill:
     seen = 0
@@ -146,7 +146,7 @@ class Kill:
         if self.seen == 6:
             os.kill(os.getpid(), signal.SIGKILL)
 
-recording.REST = 0
+engine.REST = 0
 sv.map_floor({DRIVE!r}, sys.argv[1], **{LIDAR!r}, observers=[Kill()], checkpoint_s=1e-9)
 """
 
@@ -170,7 +170,7 @@ def test_a_full_disk_ends_in_one_line_that_tells_what_is_left(tmp_path, monkeypa
         save(self, *where)
 
     monkeypatch.setattr(GridMapper, "save", fill_up)
-    monkeypatch.setattr(recording, "REST", 0)
+    monkeypatch.setattr(engine, "REST", 0)
     with pytest.raises(MapFileError, match=r"No space left on device\); .*a.yaml holds this run up to frame 3$"):
         sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, checkpoint_s=1e-9)
     assert saved == [1, 2, 3]

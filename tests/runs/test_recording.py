@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording becomes a map by one call from Python, with all that `stereovox map` promises (tests/cli)."""
 
+import inspect
 import json
 import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import current_thread
@@ -14,9 +17,10 @@ import stereovox as sv
 from stereovox.cli import main as command
 from stereovox.cli import options
 from stereovox.errors import SourceError
+from stereovox.live import run
 from stereovox.mapping import deadline
 from stereovox.opening import open_stream
-from stereovox.runs import recording
+from stereovox.runs import engine, floor, recording, trajectory
 
 SOURCE = "sim:room?image_width=160"
 SETTINGS = {"voxel_size": 0.1, "frames": ":12"}
@@ -57,6 +61,27 @@ class Live:
             yield replace(frame, stamp_ns=i * 33_000_000, fault=None if i < self._good else "no_pose")
 
 
+def test_runs_of_cameras_load_neither_slam_nor_localisation():
+    """They take a second to load, and no camera needs them."""
+    runs = "from stereovox.runs import engine, recording, trajectory"
+    code = f"import sys; {runs}; print([name for name in sys.modules if name.startswith('stereovox.localize')])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_help_and_notebooks_see_all_options():
+    for function, kind in (
+        (sv.map_recording, recording.RecordingOptions),
+        (sv.MapRun, recording.RecordingOptions),
+        (sv.map_floor, floor.FloorOptions),
+        (sv.map_live, run.LiveOptions),
+        (sv.track_recording, trajectory.TrackOptions),
+    ):
+        shown = inspect.signature(function).parameters
+        assert set(kind.names()) < set(shown)
+        assert [name for name, one in shown.items() if one.kind == one.VAR_KEYWORD]
+    assert {"grid", "mavlink"} < set(inspect.signature(sv.map_live).parameters)
+
+
 def test_it_makes_the_map_of_the_command(tmp_path):
     seen = Seen()
     result = sv.map_recording(SOURCE, tmp_path / "a.svox", **SETTINGS, observers=[seen])
@@ -65,7 +90,7 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert result.out == tmp_path / "a.svox"
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
-    assert options.CHECKPOINT_S == recording.CHECKPOINT_S
+    assert options.CHECKPOINT_S == engine.CHECKPOINT_S
 
 
 class Breaking:
@@ -258,7 +283,7 @@ def test_a_map_made_level_with_a_profile(tmp_path):
 
 @pytest.mark.usefixtures("obeys_signals")
 def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monkeypatch):
-    set_handler, usual = signal.signal, [signal.getsignal(number) for number in recording._default_signals()]
+    set_handler, usual = signal.signal, [signal.getsignal(number) for number in engine._default_signals()]
 
     def prompt(number, handler):
         before = set_handler(number, handler)
@@ -267,7 +292,7 @@ def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monk
         return before
 
     monkeypatch.setattr(signal, "signal", prompt)
-    with pytest.raises(KeyboardInterrupt), recording.ended_in_order():
+    with pytest.raises(KeyboardInterrupt), engine.ended_in_order():
         pytest.fail("the signal came before")
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == usual
 
@@ -275,4 +300,4 @@ def test_a_signal_that_comes_while_they_are_set_up_leaves_no_handler_behind(monk
 @pytest.mark.usefixtures("obeys_signals")
 def test_signals_are_left_to_the_main_thread():
     with ThreadPoolExecutor(1) as other:
-        assert other.submit(recording._default_signals).result() == []
+        assert other.submit(engine._default_signals).result() == []

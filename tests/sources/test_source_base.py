@@ -2,15 +2,17 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.errors import SourceError
+from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
-from stereovox.opening import Selection, Source, parse_slice
-from stereovox.sources.base import AHEAD, prefetch
+from stereovox.opening import SOURCES, Selection, Source, open_images, open_source, parse_slice
+from stereovox.sources.base import AHEAD, MEMBERS, Stream, kind_of, prefetch, stream_of
 
 
 class Counting(Source):
@@ -110,3 +112,96 @@ def test_what_goes_wrong_in_the_background_is_raised_in_its_turn():
     assert [next(items), next(items)] == [0, 1]
     with pytest.raises(RuntimeError):
         next(items)
+
+
+class Foreign:
+    """A class of another package that knows nothing of ours; it has a length, and a note that changes."""
+
+    name, camera, unit = "foreign", Counting().camera, None
+
+    def __init__(self):
+        self.dropped = 0
+
+    def __iter__(self):
+        yield from Counting()
+
+
+class ForeignRecording(Foreign):
+    """One whose frames can be read in any order."""
+
+    posed = False
+
+    def __len__(self):
+        return 10
+
+    def frame(self, i):
+        return Counting().frame(i)
+
+
+def test_what_a_foreign_source_lacks_is_as_for_any_stream():
+    own = Foreign()
+    stream = stream_of(own)
+    assert {name for name in MEMBERS if hasattr(Stream, name) and not hasattr(stream, name)} == set()
+    assert (stream.name, stream.camera, stream.length, stream.notes, stream.posed) == (
+        "foreign",
+        own.camera,
+        None,
+        (),
+        True,
+    )
+    assert (stream.imu(), stream.after(3), len(list(stream))) == (None, stream, 10)
+    own.dropped = 7
+    assert stream.dropped == 7  # its own, as it is now
+    assert not isinstance(stream, Source)
+    assert stream_of(stream) is stream
+
+
+def test_a_foreign_recording_is_read_in_any_order():
+    source = stream_of(ForeignRecording())
+    assert isinstance(source, Source)
+    assert (source.length, source.posed, source.gravity(), source.up) == (10, False, None, None)
+    assert source.frame(4).stamp_ns == 4
+    np.testing.assert_array_equal(source.pose(4), np.eye(4))
+    assert [frame.stamp_ns for frame in source.after(8)] == [8, 9]
+
+
+def test_a_foreign_recording_need_only_know_its_length_and_its_frames():
+    own = SimpleNamespace(name="foreign", camera=Counting().camera, length=10, frame=Counting().frame)
+    assert [frame.stamp_ns for frame in stream_of(own)] == list(range(10))
+    assert len(stream_of(own)) == 10
+
+
+@pytest.mark.parametrize("bad", [42, None, [1, 2], object()])
+def test_what_is_no_source_is_one_line(bad):
+    with pytest.raises(SourceError, match="give the name of a camera or recording, or a Stream"):
+        stream_of(bad)
+
+
+def test_a_foreign_class_that_is_registered_gets_what_it_lacks(monkeypatch):
+    monkeypatch.setitem(SOURCES, "foreign", f"{__name__}:Registered")
+    source = open_source("foreign:", "2:5")
+    assert [frame.stamp_ns for frame in source] == [2, 3, 4]
+    assert isinstance(open_images("foreign:"), Source)
+    assert kind_of(Counting) is Counting
+
+
+class Registered(ForeignRecording):
+    """One that stereovox opens by its name."""
+
+    def __init__(self, where):
+        super().__init__()
+
+    @staticmethod
+    def recognises(where):
+        return where == "foreign:"
+
+
+def test_a_frame_without_a_pose_has_none_in_any_source():
+    class Lost(Counting):
+        def frame(self, i):
+            frame = super().frame(i)
+            return frame if i else replace(frame, fault="no_pose", fault_detail="nobody knows")
+
+    with pytest.raises(FrameRefused, match="nobody knows"):
+        Lost().pose(0)
+    np.testing.assert_array_equal(Selection(Lost(), "1:").pose(0), np.eye(4))

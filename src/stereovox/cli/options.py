@@ -8,19 +8,38 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.geometry.se3 import Transform
+    from stereovox.runs.engine import RunOptions
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 """Syntax of a box: its lowest and its highest corner."""
 MAX_FILE = 10_000
 """Largest size in bytes of a file with a transform."""
 CHECKPOINT_S = 10.0
-"""Copy of `run.CHECKPOINT_S`, so that `--help` need not import `run`."""
+"""Copy of `runs.engine.CHECKPOINT_S`, so that `--help` need not import it."""
 OWN_OPTIONS = ("voxel_size", "integrator", "max_range", "threads", "device")
 """Settings that may have an option of their own."""
+
+
+USUAL: dict[str, dict[str, Any]] = {
+    "profile": {"metavar": "P", "help": "profile name or TOML file (default)"},
+    "voxel-size": {"type": float, "metavar": "M", "help": "cell size in metres"},
+    "max-range": {"type": float, "metavar": "M", "help": "largest depth in metres that is used"},
+    "threads": {"type": int, "metavar": "N", "help": "threads (1); the map does not depend on it"},
+    "frames": {"metavar": "A:B:S", "help": "only these frames, as a Python slice"},
+    "camera": {"metavar": "FILE", "help": "camera file (camera.toml) that replaces the recording's own"},
+}
+"""Options that mean the same in several commands."""
+
+
+def add_usual(parser: ArgumentParser, *names: str) -> None:
+    """Declare some of the options that mean the same in several commands."""
+    for name in names:
+        parser.add_argument(f"--{name}", **USUAL[name])
 
 
 def numbers_of(option: str, text: str, names: str) -> list[float]:
@@ -93,6 +112,7 @@ def add_checkpoint(parser: ArgumentParser) -> None:
         type=float,
         default=CHECKPOINT_S,
         metavar="SECONDS",
+        dest="checkpoint_s",
         help=f"save the map at this interval ({CHECKPOINT_S:g}; 0: only at the end), taking at most 4 %% of the time",
     )
 
@@ -113,6 +133,14 @@ def add_settings(parser: ArgumentParser, example: str) -> None:
         dest="settings",
         help=f"any other setting, for example {example}; repeatable",
     )
+
+
+def options_of(kind: type[RunOptions], arguments: Namespace) -> dict[str, Any]:
+    """Return what the command line says about a run: those of its options that the command has, and settings."""
+    settings, names = overrides(arguments), kind.names()
+    for name in sorted(set(settings) & set(names)):
+        raise StereovoxError(f"--set {name}: this is not a setting; use --{name.replace('_', '-')}")
+    return {name: getattr(arguments, name) for name in names if hasattr(arguments, name)} | settings | {"notify": say}
 
 
 def overrides(arguments: Namespace) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def _read(
     stream: Stream = open_images(name, frames)
     if camera is not None:
         stream = with_camera(stream, camera)
-    for note in getattr(stream, "notes", ()):
+    for note in stream.notes:
         say(f"note: {note}")
     if raw and stream.camera.correction:
         say(f"note: {name}: its depth correction is left out here: a new one is to be found")

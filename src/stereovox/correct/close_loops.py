@@ -20,8 +20,8 @@ from stereovox.correct.loops.positions import Positions
 from stereovox.correct.loops.submaps import Submap
 from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import check_file
+from stereovox.frame import Progress, no_progress
 from stereovox.geometry.se3 import rotation_between
-from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.mapper import Mapper
 from stereovox.mapping.rebuild import CorrectionReport, need_frames
 from stereovox.maps import VoxelMap, load_map

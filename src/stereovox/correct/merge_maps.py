@@ -14,10 +14,10 @@ from stereovox.config import Config
 from stereovox.correct.loops.closer import LoopCloser, check_one_way, ends_of
 from stereovox.correct.loops.placing import placed
 from stereovox.errors import StereovoxError
+from stereovox.frame import Progress, no_progress
 from stereovox.frame.validate import MAX_POSITION
 from stereovox.geometry.se3 import Transform
 from stereovox.kernels.threads import one_state
-from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.mapping.deadline import Levels
 from stereovox.mapping.rebuild import Rebuild, as_corrected, need_frames
 from stereovox.maps import VoxelMap

@@ -33,6 +33,7 @@ from stereovox.fleet.recordings import (
     recordings_of,
     report_of,
 )
+from stereovox.frame import Progress, no_progress
 from stereovox.maps.boxed_map import USUAL_SIDE, BoxedMap, check_boxed_target, side_of
 from stereovox.maps.cells.pyramid import coarser_layout, families, is_top, names_of, write_parent
 from stereovox.maps.files.boxed_manifest import (
@@ -47,7 +48,7 @@ from stereovox.maps.record.history import History
 from stereovox.maps.storage.boxes import MAX_SIDE, BoxEntry, BoxLayout
 from stereovox.opening import open_source
 from stereovox.products.merge import together
-from stereovox.runs.recording import SURVEYED, ended_in_order
+from stereovox.runs.engine import SURVEYED, ended_in_order
 from stereovox.runs.survey import PICTURES_UPRIGHT, survey
 
 MAX_SETTINGS = 1 << 20
@@ -55,8 +56,6 @@ MAX_BOXES = 250_000
 """Most boxes that a manifest can name, with the levels' boxes and all inputs."""
 OVERLAP = 4.0
 """Approximate upper bound on the boxes per frame."""
-Progress = Callable[[int, int, str], object]
-"""Called with steps done, steps in all, and the current activity."""
 ONE_MACHINE = {"window.size": None, "max_memory": None, "deadline_ms": None, "map.forget_s": None}
 """Settings under which a box can be mapped alone: others make a cell depend on more than the frames that see it."""
 
@@ -111,7 +110,7 @@ def map_fleet(
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress = lambda done, total, doing: None,
+    progress: Progress = no_progress,
     notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> FleetMap:

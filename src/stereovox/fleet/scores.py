@@ -22,13 +22,15 @@ from stereovox.evaluate.truth_cells import TruthCells, level
 from stereovox.files.places import Place
 from stereovox.files.safe_io import sealed, unsealed
 from stereovox.fleet.cluster import cluster
-from stereovox.fleet.fleet import Progress, suggested
+from stereovox.fleet.fleet import suggested
 from stereovox.fleet.recordings import COPY, Recording, Recordings, digest, fingerprint, local, recordings_of, why_not
+from stereovox.frame import Progress, no_progress
 from stereovox.maps.files.boxed_manifest import only_writer_at
 from stereovox.maps.files.store import MANIFEST
 from stereovox.opening import open_source
+from stereovox.runs.engine import ended_in_order
 from stereovox.runs.pose_choice import GIVEN
-from stereovox.runs.recording import MapRun, ended_in_order
+from stereovox.runs.recording import MapRun
 
 VERSION = 2
 """Version of a stored score; others are redone."""
@@ -124,7 +126,7 @@ def score_fleet(
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress = lambda done, total, doing: None,
+    progress: Progress = no_progress,
     notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> FleetScores:

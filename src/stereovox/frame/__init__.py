@@ -20,6 +20,12 @@ from stereovox.geometry.se3 import Transform, inverse
 
 NOT_GIVEN: float = nan
 """Depth scale of a frame that was made without one."""
+Progress = Callable[[int, int, str], object]
+"""Called while something takes its time: with steps done, steps in all, and the current one in words."""
+
+
+def no_progress(done: int, total: int, text: str) -> None:
+    """Ignore progress."""
 
 
 class _Assumed(float):

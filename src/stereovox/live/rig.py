@@ -17,7 +17,7 @@ from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.files.safe_io import is_number, read_table, shown
 from stereovox.frame.validate import matrix_of
 from stereovox.geometry.se3 import Transform, from_quaternion, orthonormalise, rigidity_error
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Stream, stream_of
 
 TOLERANCE = 5e-3
 """Largest entry of abs(R^T R - I) that passes for rounding."""
@@ -50,8 +50,8 @@ class LiveCamera:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.source, str | Path) and not hasattr(self.source, "name"):
-            raise SourceError(f"camera {shown(self.source)}: give the name of a camera or recording, or a Stream")
+        if not isinstance(self.source, str | Path):
+            stream_of(self.source)  # raises for what is none
         T = matrix_of(self.T_body_camera)
         if rigidity_error(T) > TOLERANCE:
             rows = "four rows of four numbers, a rotation and metres, below them 0 0 0 1"

@@ -27,7 +27,7 @@ from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera, open_images
 from stereovox.runs.pose_choice import GIVEN, HOW, TRACK, has_poses
 from stereovox.runs.survey import level_pose
-from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.base import Stream, closing, stream_of
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Latest
 from stereovox.sources.paced import Paced
@@ -149,7 +149,7 @@ class LiveStream(Stream):
         self._notify, self._seconds = notify, seconds
         self._feeds = [_feed(camera) for camera in check_cameras(cameras)]
         if poses is None:
-            poses = GIVEN if all(getattr(feed.stream, "posed", True) for feed in self._feeds) else TRACK
+            poses = GIVEN if all(feed.stream.posed for feed in self._feeds) else TRACK
         self.tracked = poses == TRACK
         self.clouds = any(feed.stream.camera == FORWARD for feed in self._feeds)
         self._stream = poses if isinstance(poses, PoseStream) else None
@@ -162,7 +162,7 @@ class LiveStream(Stream):
             raise StereovoxError(f"poses '{poses}' is no stream of poses; open it, or give {TRACK} or {GIVEN}")
         self.name, self.camera = ", ".join(feed.name for feed in self._feeds), self._feeds[0].stream.camera
         self.name += f", {HOW[TRACK]}" if self.tracked else ""
-        self.notes = tuple(note for feed in self._feeds for note in getattr(feed.stream, "notes", ()))
+        self.notes = tuple(note for feed in self._feeds for note in feed.stream.notes)
         self.moment = Moment("", None, 0)
         self.mounts = {feed.name: feed.camera.T_body_camera for feed in self._feeds}
         self._waiting: Waiting[_Image] = Waiting(QUEUE, round(1e9 * wait_s), round(1e9 * LATE_S), monotonic_ns)
@@ -181,7 +181,7 @@ class LiveStream(Stream):
 
     def imus(self) -> dict[str, Imu]:
         """Return the IMUs of the cameras that have one, by the name of the camera."""
-        found = {feed.name: imu_of(feed.stream) for feed in self._feeds}
+        found = {feed.name: feed.stream.imu() for feed in self._feeds}
         return {name: imu for name, imu in found.items() if imu is not None}
 
     def counts(self) -> dict[str, Any]:
@@ -307,18 +307,15 @@ class LiveStream(Stream):
     def _run(self, feed: _Feed) -> None:
         """Put a camera's images into its queue until it ends or nobody wants more."""
         try:
-            images = self._tracked(feed) if feed.tracked else self._noted(feed)
-            for image in images:
-                stamp_ns = image.stamp_ns - feed.ahead_ns
-                heard = feed.clock.heard(stamp_ns, monotonic_ns()) if feed.clock is not None else Heard()
-                with self._change:
-                    self._waiting.put(feed.name, stamp_ns, "", _Image(feed, image, heard))
-                    self._change.notify()
-                if self._stopped.is_set():
-                    break
-            close = getattr(images, "close", None)
-            if close:
-                close()
+            with closing(self._tracked(feed) if feed.tracked else self._noted(feed)) as images:
+                for image in images:
+                    stamp_ns = image.stamp_ns - feed.ahead_ns
+                    heard = feed.clock.heard(stamp_ns, monotonic_ns()) if feed.clock is not None else Heard()
+                    with self._change:
+                        self._waiting.put(feed.name, stamp_ns, "", _Image(feed, image, heard))
+                        self._change.notify()
+                    if self._stopped.is_set():
+                        break
         except StereovoxError as error:
             feed.failure = str(error)
         except Exception as error:  # a camera that breaks must be reported, not vanish with its thread
@@ -331,8 +328,7 @@ class LiveStream(Stream):
 
     def _noted(self, feed: _Feed) -> Iterator[AnyFrame]:
         """Yield a camera's images, and take note when they arrive."""
-        images = iter(feed.stream)
-        try:
+        with closing(feed.stream) as images:
             for image in images:
                 arrived_ns, now_ns = monotonic_ns(), epoch_ns()
                 if feed.host_clock is None:
@@ -348,10 +344,6 @@ class LiveStream(Stream):
                 yield image
                 if self._stopped.is_set():
                     return
-        finally:
-            close = getattr(images, "close", None)
-            if close:  # a generator: the camera is to stop now
-                close()
 
     def _tracked(self, feed: _Feed) -> Iterator[AnyFrame]:
         """Yield a camera's images with tracked poses, which become those of the body."""
@@ -408,7 +400,7 @@ class _LateTracker:
         """Return the pose of a frame."""
         if self._tracker is None:
             start = level_pose(frame if isinstance(frame, Frame) else None, self._config)
-            self._tracker = Tracker(self._config, start=start, imu=imu_of(self._stream))
+            self._tracker = Tracker(self._config, start=start, imu=self._stream.imu())
         return self._tracker.add(frame)
 
     def expect(self, frame: AnyFrame, /) -> None:
@@ -430,7 +422,7 @@ def _announced(images: Iterable[AnyFrame], expect: Callable[[AnyFrame], None]) -
 
 
 def _feed(camera: LiveCamera) -> _Feed:
-    stream = _opened(camera.source) if isinstance(camera.source, str | Path) else camera.source
+    stream = _opened(camera.source) if isinstance(camera.source, str | Path) else stream_of(camera.source)
     return _Feed(camera, stream, round(1e9 * camera.clock_offset_s))
 
 

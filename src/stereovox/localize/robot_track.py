@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import MissingExtra, StereovoxError
+from stereovox.frame import Progress, no_progress
 from stereovox.geometry.pose_graph import need_gtsam
 from stereovox.localize.amcl.localise import localise
 from stereovox.localize.fit import NEAR, fit_share
@@ -19,14 +20,8 @@ from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.sources.robots.robot import Robot
 
-Progress = Callable[[int, int, str], object]
-"""Called with scans done, scans in all, and the current activity."""
 DOUBTFUL = 0.6
 """Share of fitting beams below which the track may be wrong."""
-
-
-def no_progress(done: int, total: int, text: str) -> None:
-    """Ignore progress."""
 
 
 def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -> SlamResult:

@@ -7,12 +7,14 @@ the map is saved and everything is taken away; the next configuration reads the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.ros.node import MapNode
+from stereovox.ros.run import NodeRun
+from stereovox.runs.engine import Run
 
 IDLE_S = 0.1
 CREATE = {
@@ -50,62 +52,52 @@ class Entities:
         return made
 
 
-class Run(Protocol):
-    """A map that is made between configuration and cleanup.
+class Managed(Run[None, dict[str, Any]]):
+    """Holds at most one `NodeRun`, as the node's state says, until the node is shut down, or by a signal.
 
-    Attributes:
-        map_node: What makes it.
+    begin: called at configuration with what stands for the node, returns an entered run; may raise StereovoxError,
+    and then it failed.
     """
 
-    map_node: MapNode
+    usual_end = (KeyboardInterrupt,)
 
-    def step(self) -> None:
-        """Do what is due next to mapping, such as saving it."""
-
-    def end(self) -> dict[str, Any]:
-        """Map what waits, save the map, release everything; return figures for the report."""
-        ...
-
-
-class Managed:
-    """Holds at most one `Run`, as the node's state says.
-
-    begin: called at configuration with what stands for the node; may raise StereovoxError, and then it failed.
-
-    Attributes:
-        ended: Whether the node was shut down by its transition.
-        report: Figures of the last run that ended.
-    """
-
-    def __init__(self, node: Any, begin: Callable[[Any], Run]):
+    def __init__(self, node: Any, begin: Callable[[Any], NodeRun]):
         from rclpy.executors import SingleThreadedExecutor
 
-        self._node, self._begin = node, begin
+        super().__init__()
+        self._node, self._begin_run = node, begin
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._entities, self._run = Entities(node), None
-        self._over, self.ended, self.report = False, False, dict[str, Any]()
+        self._over, self._ended, self._report = False, False, dict[str, Any]()
         node.managed = self
 
-    def spin_once(self) -> None:
+    def _begin(self, stack: ExitStack) -> None:
+        """Wait for transitions."""
+
+    def _steps(self) -> Iterator[None]:
+        while not self._ended:
+            yield
+
+    def _take(self, step: None) -> None:
         """Receive messages and calls, and map one frame where the node is active."""
         if self._run is None:
             self._executor.spin_once(timeout_sec=IDLE_S)
             return
-        self._run.map_node.spin_once()
         self._run.step()
         if self._over:  # not in the callback: topics would vanish while their messages are received
-            self.close()
+            self._end()
 
-    def close(self) -> None:
-        """End the run, if any, and take away its topics."""
+    def _end(self) -> dict[str, Any]:
+        """End the run, if any, and take away its topics; return the figures of the last one."""
         run, self._run, self._over = self._run, None, False
         if run is not None:
             try:
-                self.report = run.end()
+                self._report = run.end()
             finally:
                 self._entities.destroy()
                 self._executor.add_node(self._node)
+        return self._report
 
     def configure(self) -> bool:
         """Make the topics and an empty map; return whether that was possible."""
@@ -113,7 +105,7 @@ class Managed:
             self._node.get_logger().error("not configured: the last map is still being saved; configure it again")
             return False
         try:
-            self._run = self._begin(self._entities)
+            self._run = self._begin_run(self._entities)
         except Exception as error:  # rclpy would swallow it
             self._entities.destroy()
             self._executor.add_node(self._node)
@@ -135,7 +127,7 @@ class Managed:
     def shut_down(self) -> None:
         """End the run soon, and then the process."""
         self.cleanup()
-        self.ended = True
+        self._ended = True
 
 
 def managed_node(name: str, **kwargs: Any) -> Any:

@@ -12,7 +12,7 @@ from stereovox import opening
 from stereovox.config import Config, load_config
 from stereovox.config.safety import TrustConfig
 from stereovox.errors import NoPoses, StereovoxError, did_you_mean
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Source, Stream, stream_of
 from stereovox.track.tracker import POSE_FAULTS
 
 GIVEN, TRACK, BOTH = "given", "track", "both"
@@ -59,7 +59,7 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
             f"poses '{poses}' is unknown{did_you_mean(str(poses), CHOICES)}; give given, track or both"
         )
     if not isinstance(source, str | Path):
-        return _choice(source, poses)
+        return _choice(stream_of(source), poses)
     if poses == TRACK:
         return Choice(opening.open_images(source, frames), TRACK)
     try:
@@ -95,16 +95,11 @@ def _choice(source: Stream, poses: str | None) -> Choice:
 
 def _missing(source: Stream) -> str:
     """Return why a source has no poses, empty if it has some."""
-    read = getattr(source, "frame", None)
-    if read is None or not source.length:
-        return (
-            ""
-            if getattr(source, "posed", True)
-            else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
-        )
+    if not isinstance(source, Source) or not len(source):
+        return "" if source.posed else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
     unposed = False
-    for i in np.unique(np.linspace(0, source.length - 1, min(LOOKED_AT, source.length)).astype(int)).tolist():
-        frame = read(i)
+    for i in np.unique(np.linspace(0, len(source) - 1, min(LOOKED_AT, len(source))).astype(int)).tolist():
+        frame = source.frame(i)
         if frame.fault is None and np.isfinite(frame.T_world_sensor).all():
             return ""
         unposed |= frame.fault is None or frame.fault in POSE_FAULTS

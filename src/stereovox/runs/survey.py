@@ -214,7 +214,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     pixels = sum(depth.size for depth in depths)
     max_range = suggest_range(valid, source.camera, stereo=isinstance(read[0], StereoFrame))
     positions = np.array([frame.T_world_sensor[:3, 3] for frame in posed])
-    unit = getattr(source, "unit", None)
+    unit = source.unit
     return Survey(
         name=source.name,
         kind=KINDS[type(read[0])],
@@ -235,15 +235,12 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
         up=find_up(source, posed) if posed else None,
         max_range=max_range,
         voxel_size=suggest_cell(valid, max_range.value),
-        notes=tuple(getattr(source, "notes", ())),
+        notes=tuple(source.notes),
     )
 
 
-def find_up(source: Any, frames: list[AnyFrame]) -> UpEstimate:
+def find_up(source: Source, frames: list[AnyFrame]) -> UpEstimate:
     """Find out which way is up: as the layout defines it (`source.up`), by an accelerometer, else by what was seen.
-
-    A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
-    world; horizontal surfaces near it, such as floors and tables, then give the direction and confirm it.
 
     Args:
         source: The recording.
@@ -252,13 +249,21 @@ def find_up(source: Any, frames: list[AnyFrame]) -> UpEstimate:
     Returns:
         The direction; not `sure` if the camera was turned over or saw no horizontal surface.
     """
-    known = getattr(source, "up", None)
-    if known:
-        return UpEstimate(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
-    gravity = source.gravity() if hasattr(source, "gravity") else None
+    if source.up:
+        return UpEstimate(source.up, upright_axes(source.up)[2], 0.0, True, "as this kind of recording defines it")
+    gravity = source.gravity()
     if gravity is not None:
         axis, off = _axis_near(gravity)
         return UpEstimate(axis, gravity, off, True, "by the accelerometer")
+    return _seen_up(frames)
+
+
+def _seen_up(frames: Sequence[AnyFrame]) -> UpEstimate:
+    """Find out which way is up by what posed frames see.
+
+    A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
+    world; horizontal surfaces near it, such as floors and tables, then give the direction and confirm it.
+    """
     mean = np.mean([_own_up(frame) for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:
@@ -305,7 +310,7 @@ def level_start(source: Stream, config: Config) -> Transform:
 
 def level_pose(first: Frame | None, config: Config) -> Transform:
     """Return the same, (4, 4), of a first image; None: none shows what is level."""
-    found = None if first is None else find_up(None, [replace(first, T_world_sensor=AHEAD, fault=None)])
+    found = None if first is None else _seen_up([replace(first, T_world_sensor=AHEAD, fault=None)])
     tilt = level_transform(found.direction) if found is not None and found.sure else np.eye(4)
     return level_world(config) @ tilt @ AHEAD
 
@@ -317,10 +322,10 @@ def level_world(config: Config) -> Transform:
 
 def _first_images(source: Stream) -> Iterator[Frame]:
     """Yield depth images at the start of a recording."""
-    if source.length is None or not hasattr(source, "frame"):
+    if not isinstance(source, Source):
         return
-    for i in range(min(FIRST, source.length)):
-        frame = source.frame(i)  # pyright: ignore[reportAttributeAccessIssue] - it can be read in any order
+    for i in range(min(FIRST, len(source))):
+        frame = source.frame(i)
         if isinstance(frame, Frame) and frame.depth.size:
             yield frame
 

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -13,20 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.errors import FrameRefused, SourceError, StereovoxError
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.evaluate.summary import percentiles
 from stereovox.evaluate.trajectory.trajectory_motions import travelled_m
 from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore, score_trajectory
 from stereovox.files.safe_io import check_file
-from stereovox.frame import AnyFrame
+from stereovox.frame import AnyFrame, Progress, no_progress
 from stereovox.geometry.se3 import Transform
 from stereovox.kernels.threads import expecting
-from stereovox.localize.robot_track import Progress, no_progress
-from stereovox.opening import open_stream
+from stereovox.opening import open_source
+from stereovox.runs.engine import SURVEYED, Checkpoints, Run, RunOptions, takes
 from stereovox.runs.pose_choice import TRACK, choose_poses
-from stereovox.runs.recording import SURVEYED, interrupt_between_steps
 from stereovox.runs.survey import level_start, survey
-from stereovox.sources.base import Stream, pose_reader
+from stereovox.sources.base import Source, Stream, prefetch
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS, write_trajectory
@@ -140,16 +140,22 @@ class CameraTrack:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(RunOptions):
+    """Options of `track_recording`, besides those of `RunOptions`; without a profile a quick look suggests the range.
+
+    Attributes:
+        frames: Python slice that selects frames: `"::4"`.
+        camera: Camera file that replaces the recording's own.
+    """
+
+    frames: str | None = None
+    camera: str | Path | None = None
+
+
+@takes(TrackOptions)
 def track_recording(
-    source: str | Path | Stream,
-    out: str | Path | None = None,
-    *,
-    profile: str | Path | Config | None = None,
-    frames: str | None = None,
-    camera: str | Path | None = None,
-    progress: Progress = no_progress,
-    notify: Callable[[str], None] = lambda line: None,
-    **overrides: Any,
+    source: str | Path | Stream, out: str | Path | None = None, *, progress: Progress = no_progress, **options: Any
 ) -> CameraTrack:
     """Find the poses of a camera from its own depth images or stereo pairs.
 
@@ -159,13 +165,8 @@ def track_recording(
         source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own. Its own poses are only
             compared with.
         out: File to write the poses to (`.tum` or `.txt`), all or nothing; None: none.
-        profile: Profile name, TOML file or Config; None: `default` with the range that a quick look at the recording
-            suggests.
-        frames: Python slice that selects frames: `"::4"`.
-        camera: Camera file that replaces the recording's own.
         progress: Called with frames done, their number (0 for a live camera), and the current step.
-        notify: Called with each line that a user should see.
-        **overrides: Settings by name, as for `Mapper`.
+        **options: Those of `TrackOptions`, and settings by name, as for `Mapper`.
 
     Returns:
         The pose of each frame, and where the camera was lost.
@@ -174,123 +175,124 @@ def track_recording(
         StereovoxError: One line: invalid source, settings or file, or not one frame could be tracked.
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after writing what was tracked so far.
     """
-    target = None if out is None else check_file(str(out), TRAJECTORY_ENDINGS)
-    stream = choose_poses(source, frames, TRACK).source
-    stream = stream if camera is None else with_camera(stream, str(camera))
-    config, lines = _settings(stream, profile, overrides)
-    imu, line = imu_and_note(stream)
-    for note in (*getattr(stream, "notes", ()), *lines, *filter(None, [line])):
-        notify(f"note: {note}")
-    run = _Run(stream.name)
-    tracker = Tracker(config, start=level_start(stream, config), imu=imu)
-    try:
-        with interrupt_between_steps() as check:
-            noted = run.noting(stream)
-            images = noted if stream.length is None else expecting(tracker.expect, noted)
-            for frame, tracked in follow(images, tracker):
-                run.add(frame, tracked)
-                progress(run.spans.frames, stream.length or 0, DOING)
-                check()
-    except (KeyboardInterrupt, SourceError):
-        if _save(run.track(), target):
-            notify(f"stopped after {run.spans.frames} frames; their poses are saved in {target}")
-        raise
-    if tracker.picture_use():
-        notify(f"note: {tracker.picture_use()}")
-    if tracker.imu_use:
-        notify(f"note: {tracker.imu_use}")
-    found = replace(run.track(), imu=tracker.imu_use)
-    if not found.tracked.any():
-        why = found.lost[0].why if found.lost else "it is empty"
-        raise StereovoxError(f"{stream.name}: not one frame could be tracked, nothing is written ({why})")
-    _save(found, target)
-    return replace(found, score=_score(found, run.given(stream, source, frames)))
+    with _TrackRun(source, out, progress, TrackOptions.of(options)) as run:
+        found = run.finish()
+        return replace(found, score=_score(found, run.own_poses()))
 
 
-def _save(found: CameraTrack, target: Path | None) -> bool:
-    """Write the poses, if there are any and a file is wanted; return whether they were written."""
-    if target is None or not found.tracked.any():
-        return False
-    found.save(target)
-    return True
+class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
+    """A run whose steps are frames with their tracked poses."""
 
-
-def _settings(stream: Stream, profile: Any, overrides: dict[str, Any]) -> tuple[Config, list[str]]:
-    """Return the settings, those that a recording suggests among them, and lines about these."""
-    if profile is not None or stream.length is None or not hasattr(stream, "frame"):
-        return load_config("default" if profile is None else profile, **overrides), []
-    found = replace(survey(stream, SURVEYED), up=None)  # pyright: ignore[reportArgumentType] - it has frame(i)
-    chosen, lines = found.settings(overrides)
-    return load_config("default", **{**overrides, **chosen}), lines
-
-
-class _Run:
-    """Collects what is found, frame by frame."""
-
-    def __init__(self, name: str):
-        self.spans, self._name = LostSpans(), name
+    def __init__(self, source: str | Path | Stream, out: str | Path | None, progress: Progress, options: TrackOptions):
+        super().__init__(options.notify)
+        self._source, self._out, self._progress, self._options = source, out, progress, options
+        self._spans, self._any = LostSpans(), False
         self._stamps: list[int] = []
         self._tracked: list[Tracked] = []
         self._given: list[NDArray[np.float64]] = []
-        self._ends = [perf_counter()]
 
-    def noting(self, frames: Iterable[AnyFrame]) -> Iterator[AnyFrame]:
+    def _begin(self, stack: ExitStack) -> None:
+        self._target = None if self._out is None else check_file(str(self._out), TRAJECTORY_ENDINGS)
+        stream = choose_poses(self._source, self._options.frames, TRACK).source
+        camera = self._options.camera
+        self._stream = stream = stream if camera is None else with_camera(stream, str(camera))
+        config, lines = self._suggested()
+        imu, line = imu_and_note(stream)
+        for note in (*stream.notes, *lines, *filter(None, [line])):
+            self._notify(f"note: {note}")
+        self._tracker = Tracker(config, start=level_start(stream, config), imu=imu)
+        self._checkpoints = Checkpoints(self._save, self._target, 0)
+
+    def _suggested(self) -> tuple[Config, list[str]]:
+        """Return the settings, those that a recording suggests among them, and lines about these."""
+        profile, given, stream = self._options.profile, self._options.settings, self._stream
+        if profile is not None or not isinstance(stream, Source):
+            return load_config("default" if profile is None else profile, **given), []
+        found = replace(survey(stream, SURVEYED), up=None)  # pyright: ignore[reportArgumentType] - it has frame(i)
+        chosen, lines = found.settings(given)
+        return load_config("default", **{**given, **chosen}), lines
+
+    def _steps(self) -> Iterable[tuple[AnyFrame, Tracked]]:
+        self._ends = [perf_counter()]
+        noted = self._noting(self._stream)
+        return follow(noted if self._stream.length is None else expecting(self._tracker.expect, noted), self._tracker)
+
+    def _noting(self, frames: Iterable[AnyFrame]) -> Iterator[AnyFrame]:
         """Yield frames, and take note of their own poses."""
         for frame in frames:
             self._given.append(_own_pose(frame))
             yield frame
 
-    def add(self, frame: AnyFrame, tracked: Tracked) -> None:
-        """Take note of a frame that was tracked or lost."""
-        self.spans.add(frame.stamp_ns, tracked.lost)
+    def _take(self, step: tuple[AnyFrame, Tracked]) -> None:
+        frame, tracked = step
+        self._spans.add(frame.stamp_ns, tracked.lost)
         self._stamps.append(frame.stamp_ns)
         self._tracked.append(tracked)
+        self._any |= not tracked.lost
         self._ends.append(perf_counter())
+        self._progress(self._spans.frames, self._stream.length or 0, DOING)
 
-    def track(self) -> CameraTrack:
+    @property
+    def _kept(self) -> int:
+        """Number of frames whose poses are worth a file."""
+        return self._spans.frames if self._any and self._target is not None else 0
+
+    def _stopped_line(self) -> str:
+        return f"stopped after {self._spans.frames} frames; their poses are saved in {self._target}"
+
+    def _save(self) -> None:
+        if self._target is not None:
+            self._found().save(self._target)
+
+    def _found(self) -> CameraTrack:
         """Return what was found so far."""
         nowhere = np.full((4, 4), np.nan)
         poses = [nowhere if tracked.lost else tracked.T_world_sensor for tracked in self._tracked]
         return CameraTrack(
-            self._name,
+            self._stream.name,
             np.array(self._stamps, np.int64),
             np.array(poses).reshape(-1, 4, 4),
             np.array([tracked.covariance for tracked in self._tracked]).reshape(-1, 6, 6),
-            tuple(self.spans.spans),
+            tuple(self._spans.spans),
             1e3 * np.diff(self._ends),
+            imu=self._tracker.imu_use,
         )
 
-    def given(self, stream: Stream, source: Any, frames: str | None) -> NDArray[np.float64]:
+    def _end(self) -> CameraTrack:
+        for line in filter(None, (self._tracker.picture_use(), self._tracker.imu_use)):
+            self._notify(f"note: {line}")
+        found = self._found()
+        if not found.tracked.any():
+            why = found.lost[0].why if found.lost else "it is empty"
+            raise StereovoxError(f"{self._stream.name}: not one frame could be tracked, nothing is written ({why})")
+        self._save()
+        return found
+
+    def own_poses(self) -> NDArray[np.float64]:
         """Return the recording's own poses (N, 4, 4), NaN if there are none."""
         given = np.array(self._given).reshape(-1, 4, 4)
-        if getattr(stream, "posed", True) and np.isfinite(given).any():
+        if self._stream.posed and np.isfinite(given).any():
             return given
         nothing = np.full_like(given, np.nan)
-        if not isinstance(source, str | Path) or stream.length is None:
+        if not isinstance(self._source, str | Path) or self._stream.length is None:
             return nothing
         try:
-            found = open_stream(source, frames)
+            own = _own_poses(open_source(self._source, self._options.frames))
         except StereovoxError:
             return nothing
-        own = _own_poses(found)
         return own if len(own) == len(given) else nothing
 
 
-def _own_poses(source: Stream) -> NDArray[np.float64]:
+def _own_poses(source: Source) -> NDArray[np.float64]:
     """Return the poses (N, 4, 4) of a recording, NaN if there is none; without its images where it can do so."""
-    read = pose_reader(source)
-    if read is None:
-        poses = [_own_pose(frame) for frame in source]
-    else:
-        poses = [_pose_or_none(read, i) for i in range(source.length or 0)]
-    return np.array(poses).reshape(-1, 4, 4)
 
+    def pose(i: int) -> Transform:
+        try:
+            return np.asarray(source.pose(i), float)
+        except FrameRefused:
+            return np.full((4, 4), np.nan)
 
-def _pose_or_none(read: Callable[[int], Transform], i: int) -> Transform:
-    try:
-        return np.asarray(read(i), float)
-    except FrameRefused:
-        return np.full((4, 4), np.nan)
+    return np.array(list(prefetch(pose, len(source)))).reshape(-1, 4, 4)
 
 
 def _own_pose(frame: AnyFrame) -> NDArray[np.float64]:

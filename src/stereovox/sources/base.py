@@ -1,23 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocols of sources of frames, reading ahead in the background, and selections of frames."""
+"""What sources of frames are and may have, reading ahead in the background, and selections of frames."""
 
 from __future__ import annotations
 
 import copy
 import os
 import sys
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar, overload
+from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.errors import SourceError
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.files.safe_io import shown
 from stereovox.frame import AnyFrame, Frame
 from stereovox.geometry.se3 import Transform
 from stereovox.sources.imu import Imu
@@ -67,11 +70,13 @@ AHEAD = 4
 """Frames read ahead: enough to even out slow ones, at 0.6 MB each for 640x480."""
 
 
-class Stream(Protocol):
-    """Frames in time order from a recording or a live camera; it may lack a length and a way to rewind.
+class Stream(ABC):
+    """Frames in time order from a recording or a live camera; it need not have a length nor be rewindable.
 
-    A registered class also has `recognises(where: str) -> bool`, which is cheap and never raises, and is constructed
-    from `where` alone; it raises SourceError if the recording or device as a whole is unusable.
+    A class need not derive from this one, nor from `Source`: all but `name`, `camera` and the frames is optional, and
+    what it lacks is then as it is here (`stream_of`). A registered class also has `recognises(where: str) -> bool`,
+    which is cheap and never raises, and is constructed from `where` alone; it raises SourceError if the recording or
+    device as a whole cannot be used.
 
     Attributes:
         name: Short name for messages and reports.
@@ -82,6 +87,7 @@ class Stream(Protocol):
         parts: Contents of a folder of this layout, to report what is missing.
         up: The world's axis that points up (`z`, `-y`), if this kind of recording defines it; else None.
         posed: Whether anything is known about the camera's poses.
+        unit: Unit of the depth images (`DepthUnit`); None if it is not known.
         composite: The class combines other recordings; its second argument is the function that opens them (see
             `CameraPair`).
     """
@@ -93,6 +99,7 @@ class Stream(Protocol):
     parts: tuple[Part, ...] = ()
     up: str | None = None
     posed: bool = True
+    unit: Any = None
     composite: bool = False
 
     @property
@@ -104,6 +111,11 @@ class Stream(Protocol):
     def dropped(self) -> int:
         """Frames that a live camera delivered but that were not consumed in time; 0 for a recording."""
         return 0
+
+    @property
+    def why_none(self) -> str:
+        """Why no frame came, if none did, in words."""
+        return "the source is empty"
 
     def after(self, count: int) -> Stream:
         """Skip frames, to resume a run.
@@ -130,10 +142,11 @@ class Stream(Protocol):
         """
         return None
 
+    @abstractmethod
     def __iter__(self) -> Iterator[AnyFrame]: ...
 
 
-class Source(Stream, Protocol):
+class Source(Stream):
     """A recorded stream: its frames can be counted and read in any order."""
 
     @property
@@ -153,8 +166,10 @@ class Source(Stream, Protocol):
         """
         return None
 
+    @abstractmethod
     def __len__(self) -> int: ...
 
+    @abstractmethod
     def frame(self, i: int) -> AnyFrame:
         """Read one frame.
 
@@ -170,6 +185,23 @@ class Source(Stream, Protocol):
             IndexError: There is no such frame.
         """
         ...
+
+    def pose(self, i: int) -> Transform:
+        """Read the pose of one frame; a recording that can do so without the image overrides this.
+
+        Args:
+            i: Number of the frame, 0 to len - 1.
+
+        Returns:
+            T_world_sensor (4, 4).
+
+        Raises:
+            FrameRefused: The frame has none.
+        """
+        frame = self.frame(i)
+        if frame.fault:
+            raise FrameRefused(frame.fault, frame.fault_detail)
+        return frame.T_world_sensor
 
     def __iter__(self) -> Iterator[AnyFrame]:
         return prefetch(self.frame, len(self))
@@ -190,9 +222,10 @@ class Source(Stream, Protocol):
         return cls(where)  # pyright: ignore[reportCallIssue] - registered classes are constructed from `where`
 
 
-class DepthSource(Source, Protocol):
+class DepthSource(Source):
     """A source of depth images rather than stereo pairs."""
 
+    @abstractmethod
     def frame(self, i: int) -> Frame:
         """Read frame `i` as `Source.frame` does."""
         ...
@@ -206,8 +239,8 @@ class Changed(Stream):
 
     def __init__(self, stream: Stream):
         self._stream = stream
-        self.name, self.camera, self.notes = stream.name, stream.camera, tuple(getattr(stream, "notes", ()))
-        self.posed = getattr(stream, "posed", True)
+        self.name, self.camera, self.notes = stream.name, stream.camera, tuple(stream.notes)
+        self.posed = stream.posed
 
     def change(self, frame: AnyFrame) -> AnyFrame:
         """Return the frame to deliver for a frame of the stream."""
@@ -225,7 +258,7 @@ class Changed(Stream):
 
     def imu(self) -> Imu | None:
         """Return the IMU of the stream."""
-        return imu_of(self._stream)
+        return self._stream.imu()
 
     def after(self, count: int) -> Stream:
         """Return the frames after `count`, changed in the same way."""
@@ -234,13 +267,8 @@ class Changed(Stream):
         return rest
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        frames = iter(self._stream)
-        try:
+        with closing(self._stream) as frames:
             yield from map(self.change, frames)
-        finally:
-            close = getattr(frames, "close", None)
-            if close:  # a generator: a live camera must stop now
-                close()
 
 
 class Selection(Source):
@@ -259,16 +287,15 @@ class Selection(Source):
         if not self.picked:
             raise SourceError(f"frames '{frames}' selects none of the {len(source)} frames of {source.name}; widen it")
         self.name, self.camera = source.name, source.camera
-        self.notes, self.up = getattr(source, "notes", ()), getattr(source, "up", None)
+        self.notes, self.up = source.notes, source.up
 
     def gravity(self) -> NDArray[np.float64] | None:
-        """Return the up direction of the whole recording."""
-        measure = getattr(self.whole, "gravity", None)  # classes of other packages may lack it
-        return measure() if measure else None
+        """Return which way is up in the whole recording."""
+        return self.whole.gravity()
 
     def imu(self) -> Imu | None:
         """Return the IMU of the whole recording."""
-        return imu_of(self.whole)
+        return self.whole.imu()
 
     def __len__(self) -> int:
         return len(self.picked)
@@ -277,58 +304,110 @@ class Selection(Source):
         """Return frame number `i` of the selection."""
         return self.whole.frame(self.picked[i])
 
-
-def pose_reader(source: Stream) -> Callable[[int], Transform] | None:
-    """Return a reader of poses by frame number that skips the images; None if the source has none.
-
-    It raises FrameRefused for a frame without a pose.
-    """
-    if not isinstance(source, Selection):
-        return getattr(source, "pose", None)
-    read, picked = pose_reader(source.whole), source.picked
-    return None if read is None else lambda i: read(picked[i])
+    def pose(self, i: int) -> Transform:
+        """Return the pose of frame number `i` of the selection, as `Source.pose` does."""
+        return self.whole.pose(self.picked[i])
 
 
-class Excerpt(Stream):
+class Excerpt(Changed):
     """The frames that the Python slice `frames` (`A:B:S`, as text) selects from a live camera, counted from now.
 
     Raises SourceError if the text is not a slice, selects nothing, or counts from the end, which a live camera lacks.
     """
 
     def __init__(self, stream: Stream, frames: str):
+        super().__init__(stream)
         picked = parse_slice(frames)
         start, step = picked.start or 0, 1 if picked.step is None else picked.step
         if start < 0 or step < 0 or (picked.stop is not None and picked.stop <= start):
             raise SourceError(f"frames '{frames}' of a live camera: count forwards from its first, for example :300")
-        self._stream, self._bounds = stream, (start, picked.stop, step)
+        self._bounds = (start, picked.stop, step)
         if max(start, picked.stop or 0, step) > sys.maxsize:
             raise SourceError(f"frames '{frames}' of a live camera: numbers too large; give smaller ones")
-        self.name, self.camera = stream.name, stream.camera
-        self.notes, self.posed = getattr(stream, "notes", ()), getattr(stream, "posed", True)
-
-    @property
-    def dropped(self) -> int:
-        """Frames that the camera delivered but that were not consumed in time."""
-        return self._stream.dropped
-
-    def imu(self) -> Imu | None:
-        """Return the IMU of the camera."""
-        return imu_of(self._stream)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        frames = iter(self._stream)
-        try:
+        with closing(self._stream) as frames:
             yield from islice(frames, *self._bounds)
-        finally:
-            close = getattr(frames, "close", None)
-            if close:  # a generator: the camera must stop now, not at garbage collection
-                close()
 
 
-def imu_of(stream: Stream) -> Imu | None:
-    """Return the IMU of a stream, None if it has none; classes of other packages may lack the method."""
-    read = getattr(stream, "imu", None)
-    return read() if read else None
+class _Others(Stream):
+    """A source of a class that does not derive from `Stream`: all that it has is its own."""
+
+    def __init__(self, own: Any):
+        self._own = own
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in MEMBERS and hasattr(own := object.__getattribute__(self, "_own"), name):
+            return getattr(own, name)
+        return object.__getattribute__(self, name)
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        return iter(self._own)
+
+
+class _OthersSource(_Others, Source):
+    """The same of a recording, whose frames can be read in any order."""
+
+    def __len__(self) -> int:
+        return len(self._own) if hasattr(self._own, "__len__") else self._own.length
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        return iter(self._own) if hasattr(self._own, "__iter__") else Source.__iter__(self)
+
+    def frame(self, i: int) -> AnyFrame:
+        """Read a frame."""
+        return self._own.frame(i)
+
+
+MEMBERS = {"name", "camera", *(name for kind in (Stream, Source) for name in vars(kind) if not name.startswith("_"))}
+"""What sources have; elsewhere nobody asks whether one has it."""
+
+
+def stream_of(source: Any) -> Stream:
+    """Return a source of frames with all that a `Stream`, or a `Source`, has; itself if it derives from one.
+
+    Raises SourceError for what is none: without a name, a camera and frames.
+    """
+    if isinstance(source, Stream):
+        return source
+    counted = hasattr(source, "__len__") or isinstance(getattr(source, "length", None), int)
+    recorded = counted and hasattr(source, "frame")
+    if not (hasattr(source, "name") and hasattr(source, "camera") and (recorded or hasattr(source, "__iter__"))):
+        raise SourceError(f"source {shown(source)}: give the name of a camera or recording, or a Stream")
+    return _OthersSource(source) if recorded else _Others(source)
+
+
+class _OthersKind:
+    """A registered class that does not derive from `Stream`, with all that is asked of one."""
+
+    def __init__(self, own: Any):
+        self._own, self.recognises = own, own.recognises
+        for name in ("layout", "parts", "composite"):
+            setattr(self, name, getattr(own, name, getattr(Stream, name)))
+
+    def __call__(self, *given: Any) -> Stream:
+        return stream_of(self._own(*given))
+
+    def depth_only(self, where: str) -> Stream:
+        """Open only the depth images."""
+        return stream_of(getattr(self._own, "depth_only", self._own)(where))
+
+
+def kind_of(registered: Any) -> Any:
+    """Return a registered class so that it, and what it opens, has all that `Source` has; itself if it derives."""
+    return registered if issubclass(registered, Stream) else _OthersKind(registered)
+
+
+@contextmanager
+def closing(items: Iterable[T]) -> Iterator[Iterator[T]]:
+    """Iterate, and close a generator at the end: a live camera is to stop now, not when it happens to be collected."""
+    found = iter(items)
+    try:
+        yield found
+    finally:
+        close = getattr(found, "close", None)
+        if close:
+            close()
 
 
 def parse_slice(text: str) -> slice:

@@ -9,7 +9,7 @@ from threading import Condition, Event, Thread
 from typing import Generic, TypeVar
 
 from stereovox.frame import AnyFrame
-from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.base import Stream, closing
 from stereovox.sources.imu import Imu
 
 T = TypeVar("T")
@@ -55,16 +55,11 @@ class Latest(Generic[T]):
         """Fill the queue until the frames end or the consumer stops."""
         error = None
         try:
-            frames = iter(self._frames)
-            try:
+            with closing(self._frames) as frames:
                 for frame in frames:
                     self.dropped += queue.put(frame)
                     if queue.stopped.is_set():
                         break
-            finally:
-                close = getattr(frames, "close", None)
-                if close:  # a generator: the camera must stop now
-                    close()
         except Exception as raised:
             error = raised
         finally:  # even if a library ends the thread: no consumer may wait forever
@@ -115,8 +110,7 @@ class LatestStream(Stream):
         self._camera = camera
         self._latest: Latest[AnyFrame] = Latest(camera)
         self.name, self.camera = camera.name, camera.camera
-        self.notes, self.layout = getattr(camera, "notes", ()), getattr(camera, "layout", "")
-        self.posed = getattr(camera, "posed", True)
+        self.notes, self.layout, self.posed = camera.notes, camera.layout, camera.posed
 
     @property
     def dropped(self) -> int:
@@ -125,7 +119,7 @@ class LatestStream(Stream):
 
     def imu(self) -> Imu | None:
         """Return the IMU of the camera."""
-        return imu_of(self._camera)
+        return self._camera.imu()
 
     def __iter__(self) -> Iterator[AnyFrame]:
         return iter(self._latest)

@@ -31,8 +31,8 @@ class Paced(Stream):
 
     def __init__(self, source: Stream, rate: float = 1.0, restamp: bool = True):
         self.source, self._rate, self._restamp = source, rate, restamp
-        self.name, self.camera, self.notes = source.name, source.camera, tuple(getattr(source, "notes", ()))
-        self.posed = getattr(source, "posed", True)
+        self.name, self.camera, self.notes = source.name, source.camera, tuple(source.notes)
+        self.posed = source.posed
         self.late = 0
         self._stopped = Event()
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from stereovox.frame import AnyFrame
 from stereovox.geometry.se3 import Transform
-from stereovox.sources.base import Changed, Source, Stream, imu_of
+from stereovox.sources.base import Changed, Source, Stream
 from stereovox.sources.imu import Imu
 
 
@@ -32,7 +32,7 @@ class TurnedRecording(Source):
 
     def imu(self) -> Imu | None:
         """Return the IMU of the recording."""
-        return imu_of(self._source)
+        return self._source.imu()
 
     def __len__(self) -> int:
         return len(self._source)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import rotation_matrix, rotation_vector
-from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.base import Stream
 from stereovox.sources.imu import Imu, ImuReadings, up_of_force
 
 DENSITY = 5e-4
@@ -217,7 +217,7 @@ class Gyroscope:
 def imu_and_note(stream: Stream) -> tuple[Imu | None, str]:
     """Return the IMU of a tracked recording or camera, and a line about it; None and "" if it has none."""
     try:
-        imu = imu_of(stream)
+        imu = stream.imu()
     except SourceError as error:
         return None, f"the IMU is not used: {error}"
     if imu is None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from typing import Protocol
@@ -14,7 +13,7 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
 from stereovox.kernels.threads import expecting
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Stream, closing
 from stereovox.track.fit import LOST, deviations
 from stereovox.track.tracker import POSE_FAULTS, Tracked
 
@@ -92,9 +91,8 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
             lost.
         tracker: Finds the poses.
     """
-    images = iter(frames)
     waiting: tuple[AnyFrame, Tracked] | None = None
-    try:
+    with closing(frames) as images:
         for frame in images:
             tracked = _track(frame, tracker)
             if waiting is not None:
@@ -104,10 +102,6 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
                 yield posed(frame, tracked), tracked
         if waiting is not None:
             yield _begun(*waiting, why=waiting[1].lost)
-    finally:
-        close = getattr(images, "close", None)
-        if close:  # a generator: stop a live camera now
-            close()
 
 
 def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.map.localize import add_start
-from stereovox.cli.options import add_checkpoint, overrides
+from stereovox.cli.options import add_checkpoint, add_usual, options_of
 from stereovox.cli.robot_options import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
     but_few,
@@ -43,7 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--use", choices=("depth", "lidar", "both"), help="readings to map (depth images if there are any)"
     )
     parser.add_argument("--frames", metavar="A:B:S", help="only these readings, as a Python slice")
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    add_usual(parser, "voxel-size")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest range in metres that is used")
     parser.add_argument("--mode", choices=MODES, default="trinary", help="how the files store probabilities (trinary)")
     parser.add_argument(
@@ -57,21 +57,16 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Map the recording, save the map and print a summary."""
     from stereovox.localize.robot_track import parse_start
 
-    start = parse_start(arguments.start or "")
-    return run_floor(arguments, poses=arguments.poses, use=arguments.use, start=start, mode=arguments.mode)
+    arguments.start = parse_start(arguments.start or "")
+    return run_floor(arguments)
 
 
-def run_floor(arguments: Namespace, **more: Any) -> dict[str, Any]:
-    """Make a floor map with progress bars and print a summary; more: arguments of `map_floor` that `map` has not."""
-    from stereovox.runs.floor import FloorRun
+def run_floor(arguments: Namespace) -> dict[str, Any]:
+    """Make a floor map with progress bars and print a summary."""
+    from stereovox.runs.floor import FloorOptions, FloorRun
 
-    given = overrides(arguments)
-    named = {"voxel_size": given["voxel_size"]} if "voxel_size" in given else {}  # else a map to resume has its own
-    run = FloorRun(
-        arguments.source, arguments.out, profile=settings_of(arguments), frames=arguments.frames,
-        resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, notify=say, **named, **more,
-    )  # fmt: skip
-    with run:
+    options = options_of(FloorOptions, arguments) | {"profile": settings_of(arguments)}
+    with FloorRun(arguments.source, arguments.out, **options) as run:
         say_about_compiling()
         with progress_of_steps("finding the trajectory") as progress:
             run.find_track(progress)

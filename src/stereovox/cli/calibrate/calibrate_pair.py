@@ -52,7 +52,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if arguments.out is not None:
         check_outputs(arguments.out)
     depth = open_depth(folder, settings)
-    for note in getattr(depth, "notes", ()):
+    for note in depth.notes:
         say(f"note: {note}")
     depth = cast("DepthSource", Selection(depth, arguments.frames)) if arguments.frames else depth
     try:

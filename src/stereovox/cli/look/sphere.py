@@ -10,7 +10,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import check_ending
+from stereovox.cli.options import add_usual, check_ending
 from stereovox.cli.terminal import say, say_about_compiling, tracked
 from stereovox.errors import StereovoxError
 
@@ -28,9 +28,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, or a simulation")
     parser.add_argument("--out", metavar="FILE.png", help="picture of all directions to write")
     parser.add_argument("--step", type=float, metavar="DEG", help=f"width of a cell (the profile's, else {STEP_DEG:g})")
-    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    add_usual(parser, "frames")
     parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (default)")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    add_usual(parser, "max-range")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import add_settings, overrides
+from stereovox.cli.options import add_settings, add_usual, overrides
 from stereovox.cli.terminal import (
     but_few,
     cells_line,
@@ -39,8 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--out", metavar="MAP", required=True, help="folder or s3://bucket/NAME.svox of the map")
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default: as before, or default)")
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    add_usual(parser, "voxel-size", "max-range")
     parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 or 512 cells, by reach)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
     parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")

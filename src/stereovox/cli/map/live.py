@@ -12,7 +12,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import add_checkpoint, add_settings, check_ending, heights_of, overrides
+from stereovox.cli.options import add_checkpoint, add_settings, add_usual, check_ending, heights_of, options_of
 from stereovox.cli.terminal import (
     but_few,
     cells_line,
@@ -53,7 +53,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--clock-offset", type=float, metavar="S", help="image stamp minus the stamp of a pose at that moment (0)"
     )
     parser.add_argument(
-        "--wait", type=float, default=WAIT_S, metavar="S", help=f"how long an image waits for its pose ({WAIT_S:g})"
+        "--wait",
+        type=float,
+        default=WAIT_S,
+        metavar="S",
+        dest="wait_s",
+        help=f"how long an image waits for its pose ({WAIT_S:g})",
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="how long to map (until Ctrl-C)")
     parser.add_argument("--grid", metavar="FILE.yaml", help="2-D map (map_server) to keep up to date")
@@ -69,32 +74,25 @@ def add_arguments(parser: ArgumentParser) -> None:
     about = "tell an autopilot at this address (udpout:127.0.0.1:14540) of obstacles: OBSTACLE_DISTANCE"
     parser.add_argument("--mavlink", metavar="URL", help=about)
     parser.add_argument("--resume", action="store_true", help="continue the map at --out, in the world of its poses")
-    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
-    parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
+    add_usual(parser, "profile", "voxel-size", "max-range", "threads")
     add_settings(parser, "deadline_ms=25")
     add_checkpoint(parser)
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map until Ctrl-C or SIGTERM, save the map and print a summary."""
-    from stereovox.live.run import LiveRun
+    from stereovox.live.run import OUTPUTS, LiveOptions, LiveRun
 
     check_ending("--sphere", arguments.sphere, ".png")
-    given = {"poses": arguments.poses, "profile": arguments.profile, "resume": arguments.resume}
-    given |= {"wait_s": arguments.wait, "seconds": arguments.seconds, "checkpoint_s": arguments.checkpoint}
-    live = LiveRun(_cameras(arguments), arguments.out, **given, notify=say, **overrides(arguments))
+    live = LiveRun(_cameras(arguments), arguments.out, **options_of(LiveOptions, arguments))
     with live, ExitStack() as stack:
         say_about_compiling()
         if arguments.view is not None:
             from stereovox.cli.look.view import silence_server_log
 
             silence_server_log()
-        live.add_outputs(
-            grid=arguments.grid, heights=heights_of(arguments.heights), sphere=arguments.sphere,
-            record=arguments.record, view=arguments.view, mavlink=arguments.mavlink,
-        )  # fmt: skip
+        outputs = {name: getattr(arguments, name) for name in OUTPUTS}
+        live.add_outputs(**{**outputs, "heights": heights_of(arguments.heights)})
         if live.page:
             say(f"open {live.page} in a browser to see the map grow")
         say("mapping; Ctrl-C ends")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.correct.loops import say_closure
 from stereovox.cli.look.live_page import page_of, rerun_of
-from stereovox.cli.options import add_checkpoint, add_settings, check_ending, overrides
+from stereovox.cli.options import add_checkpoint, add_settings, add_usual, check_ending, options_of
 from stereovox.cli.terminal import (
     but_few,
     cells_line,
@@ -51,11 +51,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"
     )
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    add_usual(parser, "voxel-size")
     parser.add_argument("--integrator", metavar="NAME", help="projective (default), ray or line")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
-    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
-    parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
+    add_usual(parser, "max-range", "frames", "camera")
     parser.add_argument(
         "--poses",
         metavar="WHICH",
@@ -69,7 +67,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
     )
-    parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
+    add_usual(parser, "threads")
     parser.add_argument(
         "--device", metavar="NAME", help="cpu (default), or cuda: an NVIDIA graphics card, if there is one"
     )
@@ -115,14 +113,9 @@ def _usual_out(arguments: Namespace, ending: str) -> str:
 
 
 def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
-    from stereovox.runs.recording import MapRun
+    from stereovox.runs.recording import MapRun, RecordingOptions
 
-    run = MapRun(
-        arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, level=arguments.level, poses=arguments.poses,
-        close_loops=arguments.close_loops, checkpoint_s=arguments.checkpoint,
-        notify=say, **overrides(arguments),
-    )  # fmt: skip
+    run = MapRun(arguments.source, out, **options_of(RecordingOptions, arguments))
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
         with rerun_of(run.mapper, arguments.rerun) as recorded, progress_of(run.remaining, "mapping") as bar:

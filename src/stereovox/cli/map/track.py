@@ -10,7 +10,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import add_settings, check_ending, overrides
+from stereovox.cli.options import add_settings, add_usual, check_ending, options_of
 from stereovox.cli.terminal import command_line, progress_of_steps, say, say_about_compiling, say_lost
 
 if TYPE_CHECKING:
@@ -30,27 +30,22 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     about = "the way from above, where the camera was lost, and errors where the recording has poses"
     parser.add_argument("--picture", metavar="FILE.png", help=about)
-    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
-    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
-    parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
+    add_usual(parser, "profile", "max-range", "frames", "camera")
     add_settings(parser, "noise.subpixel=0.1")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Track the source, write its poses and print a summary."""
     from stereovox.files.safe_io import check_file
-    from stereovox.runs.trajectory import track_recording
+    from stereovox.runs.trajectory import TrackOptions, track_recording
 
     check_ending("--picture", arguments.picture, ".png")
     if arguments.picture:
         check_file(arguments.picture, (".png",))
     say_about_compiling()
     with progress_of_steps("tracking") as progress:
-        found = track_recording(
-            arguments.source, arguments.out, profile=arguments.profile, frames=arguments.frames,
-            camera=arguments.camera, progress=progress, notify=say, **overrides(arguments),
-        )  # fmt: skip
+        options = options_of(TrackOptions, arguments)
+        found = track_recording(arguments.source, arguments.out, progress=progress, **options)
     result = found.summary()
     median = f"{result['frame_ms']['median']:.3g} ms a frame (median)"
     say(f"{result['tracked']} of {result['frames']} frames tracked, a way of {result['length_m']:.2f} m, {median}")

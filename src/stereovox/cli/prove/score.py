@@ -12,7 +12,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import Any
 
-from stereovox.cli.options import add_settings, overrides
+from stereovox.cli.options import add_settings, add_usual, overrides
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling, say_table, thousands
 
 EXAMPLES = """stereovox score 'training/image_02/*' --profile default --profile valenti2018 --out scores
@@ -31,8 +31,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     about = "profile name or TOML file; repeatable, to compare them (default, cells and range as suggested)"
     parser.add_argument("--profile", action="append", metavar="P", help=about)
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    add_usual(parser, "voxel-size", "max-range")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames of each recording, as a Python slice")
     parser.add_argument(
         "--free",

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.options import add_usual
 from stereovox.cli.terminal import cells_line, command_line, say, thousands, tracked
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--max-range", type=float, default=20.0, metavar="M", help="depth along the optical axis in metres (20)"
     )
-    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    add_usual(parser, "frames")
     parser.add_argument(
         "--free",
         choices=("view", "rays"),
@@ -73,7 +74,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _with_progress(numbers: Iterable[int], count: int) -> Iterator[int]:
     """Yield the frame numbers with a progress bar; Ctrl-C stops between two."""
-    from stereovox.runs.recording import interrupt_between_steps
+    from stereovox.runs.engine import interrupt_between_steps
 
     with interrupt_between_steps() as check:
         for i in tracked(numbers, count, "scans"):

@@ -8,28 +8,19 @@ OctoMap and diagnostics out. All options and settings can also be given as param
 from __future__ import annotations
 
 from argparse import REMAINDER, ArgumentParser, Namespace
-from collections import deque
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import add_settings, overrides
-from stereovox.cli.terminal import but_few, milliseconds, say, say_about_compiling
-from stereovox.errors import MapFileError
-from stereovox.files.safe_io import FLOOR_ENDINGS, check_file, check_in_space
+from stereovox.cli.options import add_settings, add_usual, overrides
+from stereovox.cli.terminal import milliseconds, say, say_about_compiling
 
 if TYPE_CHECKING:
-    from stereovox.config import Config
     from stereovox.frame import UpdateReport
-    from stereovox.ros.mapping import Mapping
-    from stereovox.ros.node import MapNode
-    from stereovox.ros.options import Options
-    from stereovox.runs.recording import Checkpoints
+    from stereovox.ros.run import NodeRun
 
 EXAMPLES = """stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox
 stereovox ros2 --scan /scan --out floor.yaml"""
-MAX_REPORTS = 10_000
-"""Number of last frames whose times are summarised at the end."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -70,12 +61,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--lifecycle", action="store_true", help=about)
     parser.add_argument("--out", metavar="MAP", help="where to save the map at the end, and when the service is called")
     parser.add_argument("--load", metavar="MAP", help="continue this map")
-    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    add_usual(parser, "profile", "voxel-size", "max-range")
     add_settings(parser, "sensor.model=andert")
     parser.add_argument(
-        "--checkpoint", type=float, default=0.0, metavar="SECONDS",
+        "--checkpoint", type=float, default=0.0, metavar="SECONDS", dest="checkpoint_s",
         help="save the map at this interval; frames wait meanwhile (0: only at the end)",
     )  # fmt: skip
     parser.add_argument(
@@ -91,105 +80,36 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     check_installed()
     from stereovox.ros.library import running_node
+    from stereovox.ros.lifecycle import Managed, managed_node
 
     if arguments.lifecycle:
-        return _run_managed(arguments)
-    with running_node(arguments.ros_args) as node, ExitStack() as stack:
-        return _map(_Run(arguments, node, stack))
+        with running_node(arguments.ros_args, managed_node) as node:
+            say("unconfigured: ros2 lifecycle set /stereovox configure, then activate; Ctrl-C ends")
+            return Managed(node, lambda entities: _run_of(arguments, entities).__enter__()).finish()
+    with running_node(arguments.ros_args) as node, _run_of(arguments, node) as map_run:
+        say("listening; Ctrl-C ends")
+        return map_run.finish()
 
 
-def _run_managed(arguments: Namespace) -> dict[str, Any]:
-    """Do as the node's transitions say, until it is shut down or Ctrl-C or SIGTERM."""
-    from stereovox.ros.library import running_node
-    from stereovox.ros.lifecycle import Managed, managed_node
-    from stereovox.runs.recording import interrupt_between_steps
+def _run_of(arguments: Namespace, node: Any) -> NodeRun:
+    """Return the run of a node, with the parameters that it has now; the command line overrides them."""
+    from stereovox.config import load_config
+    from stereovox.ros.options import PREFIX, Options, given_parameters, with_parameters
+    from stereovox.ros.run import NodeOptions, NodeRun
 
-    with running_node(arguments.ros_args, managed_node) as node:
-        managed = Managed(node, lambda entities: _Run(arguments, entities, ExitStack()))
-        say("unconfigured: ros2 lifecycle set /stereovox configure, then activate; Ctrl-C ends")
-        with interrupt_between_steps() as check:
-            with suppress(KeyboardInterrupt):
-                while not managed.ended:
-                    managed.spin_once()
-                    check()
-            managed.close()
-        return managed.report
-
-
-class _Run:
-    """A map that is made from now on. stack: is closed when it ends, or cannot begin."""
-
-    def __init__(self, arguments: Namespace, node: Any, stack: ExitStack):
-        with stack:
-            self._begin(arguments, node, stack)
-            self._stack = stack.pop_all()
-
-    def _begin(self, arguments: Namespace, node: Any, stack: ExitStack) -> None:
-        from stereovox.ros.node import MapNode
-        from stereovox.ros.options import OUT, freeze
-        from stereovox.runs.recording import Checkpoints
-
-        self.node, self.reports = node, deque[Any](maxlen=MAX_REPORTS)
-        self.mapping, self.options = _prepare(arguments, node, stack)
-        stack.callback(freeze(node, self.options.out))
-        self.out = lambda: str(node.get_parameter(OUT).value)
-        self.map_node = MapNode(node, self.mapping, self.options, self.out, self.reports.append)
-        period_s = arguments.checkpoint if self.options.out else 0.0
-        self._checkpoints = Checkpoints(lambda: self.mapping.save(self.out()), self.options.out, period_s)
-
-    def step(self) -> None:
-        """Save the map if a checkpoint is due."""
-        _checkpoint(self._checkpoints, self.mapping.history.frames, self.node)
-
-    def end(self) -> dict[str, Any]:
-        """Map what waits, save the map and print a summary; whatever fails, the map so far is saved."""
-        with self._stack:
-            try:
-                ended = self.map_node.close()
-            except Exception:
-                self.save()
-                raise
-            try:
-                result = _print_result(self.map_node, self.mapping, self.out(), self.reports)
-            finally:  # SLAM's map is kept where the other one cannot be
-                more = _print_ended(ended, self.options.slam_out)
-            return {**result, **more}
-
-    def save(self) -> None:
-        """Save the map as it is."""
-        _save(self.mapping, self.out())
-
-
-def _prepare(arguments: Namespace, node: Any, stack: ExitStack) -> tuple[Mapping, Options]:
-    """Return the map and the options, with all kernels compiled."""
-    from stereovox.ros.mapping import Mapping
-    from stereovox.ros.options import SLAM
-    from stereovox.ros.poses.corrections import check_corrections
-    from stereovox.ros.services import check_continuable
-    from stereovox.runs.pose_choice import NOT_COMPARED, TRACK, uncompared
-    from stereovox.runs.warm_up import warm_up
-
-    config, options = _settings(arguments, node)
-    if config.dimensions == 2 and options.localised and not arguments.load:
-        trusting = uncompared(config)
-        why = "SLAM and localisation correct the robot's pose by more than a cell at times"
-        if trusting is not config:
-            node.get_logger().info(NOT_COMPARED.format(why=why))
-        config = trusting
-    options.check_sources()
-    check_corrections(options, config)
-    _reserve(options.out, config.dimensions, stack)
-    if options.slam_out:
-        _reserve(options.slam_out, 2, stack)
+    given, settings = given_parameters(node), overrides(arguments)
+    given.options.update(
+        {name.removeprefix(PREFIX): settings.pop(name) for name in [*settings] if name.startswith(PREFIX)}
+    )
+    profile = arguments.profile or given.settings.get("profile", "default")
+    given.settings.pop("profile", None)
+    config = load_config(profile, **{**given.settings, **settings})
+    named = {one.name: getattr(arguments, one.name, None) for one in fields(Options)}
+    given.options.update({name: value for name, value in named.items() if value})
+    topics = with_parameters(Options(), given.options)
     say_about_compiling()
-    warm_up(config, options.poses == TRACK, options.localised, bool(options.cloud or options.scan))
-    tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
-    mapping = Mapping(config, options.heights, tiles, node.get_logger().warning)
-    stack.callback(mapping.close)
-    if arguments.load:
-        check_continuable(arguments.load, options.poses not in (TRACK, SLAM))
-        mapping.load(arguments.load)
-    return mapping, options
+    given_to_run = {"checkpoint_s": arguments.checkpoint_s, "load": arguments.load or ""}
+    return NodeRun(node, config, topics, NodeOptions(**given_to_run, notify=say, tell=_print_result))
 
 
 def _write_nav2(arguments: Namespace) -> dict[str, Any]:
@@ -200,117 +120,20 @@ def _write_nav2(arguments: Namespace) -> dict[str, Any]:
     return {"written": [str(path) for path in paths]}
 
 
-def _map(run: _Run) -> dict[str, Any]:
-    from stereovox.runs.recording import interrupt_between_steps
-
-    say("listening; Ctrl-C ends")
-    with interrupt_between_steps() as check:
-        try:
-            with suppress(KeyboardInterrupt):
-                while True:
-                    run.map_node.spin_once()
-                    check()
-                    run.step()
-        except Exception:  # whatever failed, the map so far is saved
-            run.save()
-            raise
-        return run.end()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
-
-
-def _print_ended(ended: dict[str, Any], slam_out: str) -> dict[str, Any]:
-    """Save SLAM's map; print what localisation, SLAM and the comparison found, and return it for JSON."""
-    from stereovox.formats.map_server import write_map_server
-
-    grid = ended.pop("slam_map", None)
-    if "localisation" in ended:
-        refused = sum(ended["localisation"]["refused"].values())
-        say(f"localised by {ended['localisation']['scans']} scans, {refused} refused")
-    if "slam" in ended:
-        say(f"SLAM: {ended['slam']['closures']} loops closed")
-    if grid is not None and slam_out:
-        write_map_server(grid, slam_out)
-        say(f"SLAM's map is saved in {slam_out}")
-    if "error" in ended:
-        eq7, coverage, contradiction = ended["error"].values()
-        parts = f"coverage {coverage:.1f}, contradiction {contradiction:.1f}"
-        say(f"error against the reference (Eq 7): {eq7:.1f} %, {parts}")
-    return ended
-
-
-def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
-    """Save the map if a checkpoint is due; a full disk is logged and does not stop the robot."""
-    try:
-        if frames:
-            checkpoints.after(frames)
-    except MapFileError as error:
-        node.get_logger().error(str(error), throttle_duration_sec=10.0)
-
-
-def _print_result(map_node: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
-    from stereovox.evaluate.summary import mostly_lost, percentiles
-
-    mapped = [one for one in reports if not one.refused]
-    result = {
-        "frames": mapping.history.frames,
-        "frames_refused": mapping.history.refused.total(),
-        "refused": dict(mapping.history.refused.most_common()),
-        "received": dict(map_node.received),
-        "dropped": dict(map_node.waiting.dropped),
-        "frame_ms": percentiles([one.match_ms + one.depth_ms + one.integrate_ms for one in mapped]),
-        "out": "",
-    }
-    came = result["frames"] + result["frames_refused"] + sum(result["dropped"].values())
-    if doubts := mostly_lost(result["frames"], came, "frames"):
-        result["doubts"] = doubts
+def _print_result(result: dict[str, Any], reports: Sequence[UpdateReport]) -> None:
+    """Print what became of the frames, and what localisation, SLAM and the comparison found."""
     say(f"{result['frames']} frames mapped, {result['frames_refused']} refused, {sum(result['dropped'].values())} late")
     for reason, number in result["refused"].items():
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
-    if mapped:
+    if not all(one.refused for one in reports):
         say(f"a frame: {milliseconds(result['frame_ms'])}")
-    if _save(mapping, out, but_few(result)):
-        result["out"] = out
-    elif out:
-        say("no frame could be used: no map is written")
-    return result
-
-
-def _save(mapping: Mapping, out: str, few: str = "") -> bool:
-    """Save the map if it holds a frame and `out` is given; return whether it was saved. few: as of `but_few`."""
-    if not (out and mapping.history.frames):
-        return False
-    mapping.save(out)
-    say(f"saved in {out}{few}")
-    return True
-
-
-def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
-    """Return the settings of the map and the options of the node; the command line overrides parameters."""
-    from stereovox.config import load_config
-    from stereovox.ros.options import LISTS, PREFIX, Options, given_parameters, with_parameters
-
-    given, settings = given_parameters(node), overrides(arguments)
-    options = {name: settings.pop(name) for name in [*settings] if name.startswith(PREFIX)}
-    profile = arguments.profile or given.settings.pop("profile", "default")
-    given.settings.pop("profile", None)
-    config = load_config(profile, **{**given.settings, **settings})
-    corrections = "corrected_path", "path_frame", "correct_jumps"
-    localisation = "lidar", "start", "slam_out", "reference"
-    names = *LISTS, "poses", *localisation, "world_frame", "base_frame", *corrections, "out"
-    named = {name: getattr(arguments, name) for name in names}
-    given.options.update({name.removeprefix(PREFIX): value for name, value in options.items()})
-    return config, with_parameters(Options(), {**given.options, **{name: one for name, one in named.items() if one}})
-
-
-def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
-    """Check that the map can be saved, and keep others from writing there."""
-    from stereovox.maps.files.lock import only_writer_in, only_writer_of_floor
-    from stereovox.maps.files.store import check_target, sweep
-
-    if out and dimensions == 2:
-        stack.enter_context(only_writer_of_floor(check_file(out, FLOOR_ENDINGS)))
-    elif out:
-        check_in_space(out)
-        check_target(Path(out))
-        stack.enter_context(only_writer_in(Path(out)))
-        sweep(Path(out))
+    if "localisation" in result:
+        refused = sum(result["localisation"]["refused"].values())
+        say(f"localised by {result['localisation']['scans']} scans, {refused} refused")
+    if "slam" in result:
+        say(f"SLAM: {result['slam']['closures']} loops closed")
+    if "error" in result:
+        eq7, coverage, contradiction = result["error"].values()
+        parts = f"coverage {coverage:.1f}, contradiction {contradiction:.1f}"
+        say(f"error against the reference (Eq 7): {eq7:.1f} %, {parts}")

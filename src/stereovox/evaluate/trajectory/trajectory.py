@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.files.safe_io import MAX_LIST, read_text
 from stereovox.geometry import se2
-from stereovox.localize.track import Track
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import ns_from_seconds
+
+if TYPE_CHECKING:
+    from stereovox.localize.track import Track
 
 TOLERANCE_S = 0.05
 """A relation is not scored if its times have no pose within this tolerance."""

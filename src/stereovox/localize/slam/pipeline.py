@@ -10,7 +10,7 @@ Submaps are registered to earlier ones by branch and bound (Hess et al. 2016); c
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config, load_config
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Scan
+from stereovox.frame import Progress, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.pose_graph import Edge, PoseGraph
 from stereovox.integrate.beams import make_beams
@@ -33,7 +33,6 @@ from stereovox.maps.occupancy import OccupancyGrid
 
 MIN_LATE_SCANS = 3
 """Consecutive late scans, in order among themselves, before deciding which stamps are wrong."""
-Progress = Callable[[int, int, str], object]
 CLOSURE_WEIGHT, PATCH_WEIGHT = 0.02, 0.1
 """Factors on a match's information: its points are not independent, nor is the map exact."""
 SCANS_PER_KEYFRAME = 2.25

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, fields
 from math import inf
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def no_others(where: str, others: dict[str, str], kind: type[LidarOptions]) -> N
         raise SourceError(f"{where}: {error}") from None
 
 
-class CloudSource(Source, Protocol):
+class CloudSource(Source):
     """A recording of clouds.
 
     Attributes:
@@ -80,14 +81,17 @@ class CloudSource(Source, Protocol):
     lidar: Lidar
     camera: Any = FORWARD
 
+    @abstractmethod
     def cloud(self, i: int) -> Cloud:
         """Return cloud number `i`, from 0; raises FrameRefused if it cannot be used."""
         ...
 
+    @abstractmethod
     def stamp_ns(self, i: int) -> int:
         """Return its time in nanoseconds."""
         ...
 
+    @abstractmethod
     def file(self, i: int) -> str | Path:
         """Return its origin, for messages."""
         ...

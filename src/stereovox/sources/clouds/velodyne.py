@@ -52,7 +52,7 @@ class Velodyne(CloudSource):
         if not self.drive.has_lidar:
             raise SourceError(f"{where}: has no lidar scans, or no calibration of the lidar; leave ?sensor= out")
         self.lidar, self.name = options.lidar, f"{self.drive.name} {SENSOR}"
-        self.notes = getattr(self.drive, "notes", ())
+        self.notes = self.drive.notes
 
     @classmethod
     def recognises(cls, where: str) -> bool:

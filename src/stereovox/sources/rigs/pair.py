@@ -69,7 +69,7 @@ class CameraPair(DepthSource):
         self._poses = open_poses(self.folder, settings)
         check_clocks(image_times(self._depth), self._poses, file)
         self._jumps = jumps(self._poses, settings.max_speed_mps, settings.max_turn_dps)
-        self.notes = (*getattr(self._depth, "notes", ()), *self._jump_note())
+        self.notes = (*self._depth.notes, *self._jump_note())
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -174,7 +174,7 @@ class CorrectedDepth(DepthSource):
 
     def __init__(self, source: DepthSource, settings: PairSettings):
         self._source, self._scale = source, settings.depth_scale
-        self.name, self.notes = source.name, getattr(source, "notes", ())
+        self.name, self.notes = source.name, source.notes
         self.camera: PinholeCamera = source.camera
         if settings.baseline is not None:
             self.camera = replace(source.camera, baseline=settings.baseline)

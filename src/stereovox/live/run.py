@@ -41,7 +41,7 @@ OUTPUTS = ("grid", "heights", "sphere", "record", "view", "mavlink")
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(MapOptions):
-    """Options of `map_live`, besides those of `MapOptions`.
+    """Options of `map_live`, in addition to those of `MapOptions`.
 
     Attributes:
         poses: `track`: the first camera is tracked by its own images; `given`: those that images come with; a name of a

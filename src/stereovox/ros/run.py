@@ -34,16 +34,16 @@ MAX_REPORTS = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class NodeOptions(MapOptions):
-    """Options of a `NodeRun`, besides those of `MapOptions`.
+    """Options of a `NodeRun`, in addition to those of `MapOptions`.
 
     Attributes:
         load: Map to continue; "": none.
-        tell: Called at the end, before the map is saved, with the figures and the reports of the last frames.
+        report: Called at the end, before the map is saved, with the figures and the reports of the last frames.
     """
 
     checkpoint_s: float = 0.0
     load: str = ""
-    tell: Callable[[dict[str, Any], Sequence[UpdateReport]], None] = lambda result, reports: None
+    report: Callable[[dict[str, Any], Sequence[UpdateReport]], None] = lambda result, reports: None
 
 
 class NodeRun(Run[None, dict[str, Any]]):
@@ -124,7 +124,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         ended = self._or_saved(self.map_node.close)
         grid = ended.pop("slam_map", None)
         result = {**self._figures(), **ended}
-        self._options.tell(result, self._reports)
+        self._options.report(result, self._reports)
         few = "".join(f", but {doubt['text']}" for doubt in result.get("doubts", ()))
         try:
             if self._save(few):

@@ -76,7 +76,7 @@ class RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions(RunOptions):
-    """Options of every run that makes a map, besides those of `RunOptions`.
+    """Options of every run that makes a map, in addition to those of `RunOptions`.
 
     Attributes:
         checkpoint_s: Seconds between two saves; 0: save only at the end.

@@ -40,7 +40,7 @@ SLAM, ODOMETRY = "slam", "odometry"
 
 @dataclass(frozen=True, kw_only=True)
 class FloorOptions(MapOptions):
-    """Options of `map_floor`, besides those of `MapOptions`.
+    """Options of `map_floor`, in addition to those of `MapOptions`.
 
     Attributes:
         poses: Source of the robot's poses: `"slam"`, `"odometry"`, or the `.yaml` of a map to localise the robot in.

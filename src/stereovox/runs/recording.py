@@ -62,7 +62,7 @@ MAX_UNUSABLE = 100
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(MapOptions):
-    """Options of `map_recording`, besides those of `MapOptions`.
+    """Options of `map_recording`, in addition to those of `MapOptions`.
 
     Attributes:
         resume: Continue the map at `out`; the frames it has already seen are skipped.

@@ -109,7 +109,7 @@ def _run_of(arguments: Namespace, node: Any) -> NodeRun:
     topics = with_parameters(Options(), given.options)
     say_about_compiling()
     given_to_run = {"checkpoint_s": arguments.checkpoint_s, "load": arguments.load or ""}
-    return NodeRun(node, config, topics, NodeOptions(**given_to_run, notify=say, tell=_print_result))
+    return NodeRun(node, config, topics, NodeOptions(**given_to_run, notify=say, report=_print_result))
 
 
 def _write_nav2(arguments: Namespace) -> dict[str, Any]:

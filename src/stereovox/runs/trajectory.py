@@ -142,7 +142,7 @@ class CameraTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions(RunOptions):
-    """Options of `track_recording`, in addition to those of `RunOptions`; without a profile a quick look suggests the range.
+    """Options of `track_recording` besides those of `RunOptions`; without a profile a quick look suggests the range.
 
     Attributes:
         frames: Python slice that selects frames: `"::4"`.

@@ -11,7 +11,6 @@ import numpy as np
 from made_faults import disk, in_child, small_map
 
 from stereovox.cli import main
-from stereovox.cli.robots import ros2
 from stereovox.config import load_config
 from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Scan
@@ -22,6 +21,7 @@ from stereovox.localize.track import Track
 from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.mapping import Mapping
+from stereovox.ros.run import reserve
 from stereovox.runs import engine
 from stereovox.runs.engine import Checkpoints
 from stereovox.sources.poses.trajectory import Trajectory
@@ -110,7 +110,7 @@ class FloorByNode(Floor):
 
     def write(self, n):
         with ExitStack() as stack:
-            ros2._reserve(str(self.out), 2, stack)
+            reserve(str(self.out), 2, stack)
             mapping = Mapping(load_config(dimensions=2, voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for k in range(2 * n):
@@ -119,7 +119,7 @@ class FloorByNode(Floor):
                 )
                 assert mapping.add(scan).refused is None
                 saves.after(k + 1)
-            ros2._save(mapping, str(self.out))
+            mapping.save(str(self.out))
 
 
 class SpaceByNode(Merge):
@@ -127,13 +127,13 @@ class SpaceByNode(Merge):
 
     def newer(self):
         with ExitStack() as stack:
-            ros2._reserve(str(self.out), 3, stack)
+            reserve(str(self.out), 3, stack)
             mapping = Mapping(load_config(voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for n, part in enumerate(self.parts, 1):
                 mapping.load(str(part))
                 saves.after(n)
-            ros2._save(mapping, str(self.out))
+            mapping.save(str(self.out))
 
 
 KINDS = {

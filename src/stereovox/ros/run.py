@@ -80,9 +80,9 @@ class NodeRun(Run[None, dict[str, Any]]):
             config = trusting
         topics.check_sources()
         check_corrections(topics, config)
-        _reserve(topics.out, config.dimensions, stack)
+        reserve(topics.out, config.dimensions, stack)
         if topics.slam_out:
-            _reserve(topics.slam_out, 2, stack)
+            reserve(topics.slam_out, 2, stack)
         warm_up(config, topics.poses == TRACK, topics.localised, bool(topics.cloud or topics.scan))
         tiles = Path(topics.out).parent / f".{Path(topics.out).name}-tiles" if topics.out else None
         self._mapping = Mapping(config, topics.heights, tiles, self._node.get_logger().warning)
@@ -174,7 +174,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         return {**found, "doubts": doubts} if doubts else found
 
 
-def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
+def reserve(out: str, dimensions: int, stack: ExitStack) -> None:
     """Check that the map can be saved, and keep others from writing there."""
     if out and dimensions == 2:
         stack.enter_context(only_writer_of_floor(check_file(out, FLOOR_ENDINGS)))

@@ -231,8 +231,14 @@ def test_mistakes_end_in_one_line(words, said, tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["mode", "use", "notify", "source"])
-def test_settings_named_as_arguments_are_unknown_settings(bag, tmp_path, capsys, name):
-    assert f"unknown setting '{name}'" in refused(
-        capsys, "grid", bag, "--out", tmp_path / "a.yaml", "--set", f"{name}=x"
-    )
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("mode", "--set mode: this is not a setting; use --mode"),
+        ("checkpoint_s", "--set checkpoint_s: this is not a setting; use --checkpoint"),
+        ("notify", "--set notify: this is not a setting; leave it out"),
+        ("source", "unknown setting 'source'"),
+    ],
+)
+def test_arguments_are_not_settings(bag, tmp_path, capsys, name, said):
+    assert said in refused(capsys, "grid", bag, "--out", tmp_path / "a.yaml", "--set", f"{name}=x")

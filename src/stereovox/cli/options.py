@@ -139,7 +139,10 @@ def options_of(kind: type[RunOptions], arguments: Namespace) -> dict[str, Any]:
     """Return what the command line says about a run: those of its options that the command has, and settings."""
     settings, names = overrides(arguments), kind.names()
     for name in sorted(set(settings) & set(names)):
-        raise StereovoxError(f"--set {name}: this is not a setting; use --{name.replace('_', '-')}")
+        option = f"use --{name.removesuffix('_s').replace('_', '-')}"
+        raise StereovoxError(
+            f"--set {name}: this is not a setting; {option if hasattr(arguments, name) else 'leave it out'}"
+        )
     return {name: getattr(arguments, name) for name in names if hasattr(arguments, name)} | settings | {"notify": say}
 
 

@@ -422,7 +422,7 @@ def test_a_plan_looks_where_the_run_reads(s3, tmp_path):
     plan = plan_fleet([folder, unposed, f"{above}/gone"], **SETTINGS)
     assert plan.frames == here.frames
     assert [re.sub(r".*gone", "gone", line) for line in plan.summary()["doubts"]] == [
-        "gone.tum: No such file or directory; give a file you may read",
+        "gone.tum: No such file or directory; give a readable file",
         "gone: no such recording in the store; check the name",
     ]  # fmt: skip
 

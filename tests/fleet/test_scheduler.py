@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from contextlib import ExitStack, contextmanager
+from time import sleep
 from uuid import uuid4
 
 import pytest
@@ -31,15 +32,22 @@ def process(module, *words):
 
 @contextmanager
 def cluster(port):
-    """Run a scheduler and two workers; yield the scheduler."""
+    """Run a scheduler and two workers; yield the scheduler once it listens, however long that takes."""
     address = f"tcp://127.0.0.1:{port}"
     with ExitStack() as stack:
         head = stack.enter_context(
             process("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
         )
+        while head.poll() is None and not listens(port):
+            sleep(0.1)
         for _ in range(2):
             stack.enter_context(process("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"))
         yield head
+
+
+def listens(port):
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", port)) == 0
 
 
 def free_port():

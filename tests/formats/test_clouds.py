@@ -227,7 +227,7 @@ def test_a_kitti_scan(tmp_path):
         ("a.xyz", b"nan 2 3\n", {"voxel_size": 1.0}, "holds no point"),
         ("a.txt", b"1311868164.3 1 2 0 0 0 0 1\n" * 3, {}, "is beyond the Earth"),
         ("a.xyz", b"1 2 3\n", {"unit": "mile"}, "--unit mile: unknown unit; give one of m, cm"),
-        ("a.xyz", b"1 2 3\n", {"heights": (0, 1)}, "--heights says nothing"),
+        ("a.xyz", b"1 2 3\n", {"heights": (0, 1)}, "--heights does not apply"),
         ("a.pcd", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", {}, "git lfs pull"),
         ("a.stl", b"solid\n", {}, "a.stl"),
         ("a.laz2", b"", {}, "did you mean '.laz'"),

@@ -188,10 +188,10 @@ def test_points_that_are_none_count_for_nothing(tmp_path):
         ("text.ply", b"7.0", b"wide", "wide"),
         ("text.pcd", b"TYPE F F F F", b"TYPE F F F", "numbers of fields"),
         ("text.pcd", b"SIZE 4", b"SIZE 3", "SIZE '3'"),
-        ("text.pcd", b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1", "no number"),
+        ("text.pcd", b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1", "not a number"),
         ("binary.pcd", b"DATA binary", b"DATA binary_zipped", "only ascii, binary, binary_compressed"),
-        ("binary.pcd", b"DATA binary", b"DATA binary_compressed", "cannot be"),
-        ("packed.pcd", b"POINTS 3", b"POINTS 9", "cannot be"),
+        ("binary.pcd", b"DATA binary", b"DATA binary_compressed", "are impossible"),
+        ("packed.pcd", b"POINTS 3", b"POINTS 9", "are impossible"),
         ("binary.pcd", b"POINTS 3", b"POINTS 4", "are left"),
     ],
 )
@@ -285,7 +285,7 @@ def test_bags_without_such_a_map(tmp_path, voxel_map):
 
 def test_options_and_endings_that_say_nothing(tmp_path):
     for path, more, what in (
-        ("a.bt", {"voxel_size": 0.1}, "--voxel-size says nothing"),
+        ("a.bt", {"voxel_size": 0.1}, "--voxel-size does not apply"),
         ("a.ply", {"topic": "/a"}, "--topic does not apply"),
         ("a.xzy", {}, r"did you mean '\.xyz'"),
         ("none.ply", {"voxel_size": 0.0}, "cannot be read"),

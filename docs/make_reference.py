@@ -11,7 +11,10 @@ from __future__ import annotations
 import re
 import runpy
 from argparse import SUPPRESS, Action, ArgumentParser
-from dataclasses import fields
+from collections.abc import Set
+from dataclasses import fields, is_dataclass
+from inspect import getdoc
+from itertools import starmap
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -19,11 +22,22 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ByteSize
 from pydantic.fields import FieldInfo
 
-from stereovox import Config, cli, load_config, registry
+from stereovox import Config, cli, load_config, opening, registry
 from stereovox.config import profile_names
 from stereovox.mapping import entrance
 from stereovox.products import context
+from stereovox.ros import options as ros_options
 from stereovox.sensors import SENSORS
+from stereovox.simulate import simulation, surround
+from stereovox.simulate.floors import floor
+from stereovox.sources.bags import recording
+from stereovox.sources.clouds import bag as cloud_bag
+from stereovox.sources.clouds import folder as cloud_folder
+from stereovox.sources.clouds.options import LidarOptions
+from stereovox.sources.realsense import realsense
+from stereovox.sources.rgbd.folder import FolderOptions
+from stereovox.sources.rigs.pair_file import PairSettings
+from stereovox.sources.robots import bag, carmen
 
 FOLDER = Path(__file__).resolve().parent / "reference"
 SOURCE = "<!-- Written by docs/make_reference.py from {}: change it there. -->"
@@ -69,6 +83,41 @@ On the command line: `--set max_range=8 --set sensor.model=valenti`. In Python: 
 **{{"sensor.model": "valenti"}})`. An unknown name is an error that suggests the right one. The settings that a map was
 made with are saved in it. Lengths are metres unless the description says otherwise. Which settings matter:
 [How to choose](../choosing.md).
+"""
+
+OPTIONS = """# Options
+
+{source}
+
+Options of a recording follow its name after a `?`, joined by `&`; quote them in a shell:
+`'scan?depth_scale=1000&poses=trajectory.log'`. Keys of [`pair.toml`](../recordings.md#a-depth-camera-and-a-tracker) are
+lines of that file. Parameters of the [ROS 2 node](../ros2.md) begin with `ros.`; most are
+also options of [`stereovox ros2`](commands.md#ros2).
+"""
+NAMED = {
+    "Depth images": FolderOptions,
+    "Bags": recording.Options,
+    "RealSense": realsense.Options,
+    "pair.toml": PairSettings,
+    "Clouds": LidarOptions,
+    "Folders of clouds": cloud_folder.Options,
+    "Clouds of a bag": cloud_bag.Options,
+    "Bags of ground robots": bag.RobotOptions,
+    "CARMEN logs": carmen.Options,
+    "Simulations": simulation.Options,
+    "sim:surround": surround.Options,
+    "sim:floor": floor.Options,
+    "ROS 2": ros_options.Options,
+}
+"""Classes of options, by what takes them."""
+
+LAYOUTS = """# Layouts
+
+{source}
+
+What `stereovox map` and `sv.open_source` read, in the order in which they are tried, and what commands for ground
+robots read, as the classes describe themselves. [Recordings](../recordings.md) is the page to begin with;
+`stereovox info` shows what a path holds.
 """
 
 REFUSALS = """# Refusals
@@ -117,6 +166,8 @@ def pages() -> dict[str, str]:
     return {
         "commands.md": _commands(),
         "settings.md": _settings(),
+        "options.md": _options(),
+        "layouts.md": _layouts(),
         "refusals.md": _refusals(),
         "outputs.md": _outputs(),
         "../figures.md": runpy.run_path(str(FOLDER.parents[1] / "benchmarks/results.py"))["page"](),
@@ -131,6 +182,32 @@ def _refusals() -> str:
 
 def _outputs() -> str:
     return OUTPUTS.format(source=SOURCE.format("stereovox.products.context"), table="\n".join(context.table()))
+
+
+def _options() -> str:
+    return "\n".join([OPTIONS.format(source=SOURCE.format("the classes of options")), *starmap(_class, NAMED.items())])
+
+
+def _class(title: str, kind: type) -> str:
+    inherited = {field.name for base in kind.__bases__ if is_dataclass(base) for field in fields(base)}
+    defaults = {field.name: field.default for field in fields(kind) if field.name not in inherited}
+    prefix = ros_options.PREFIX if kind is ros_options.Options else ""
+    about, texts = _described(kind, list(defaults), prefix)
+    lines = [f"## {title}", "", about, "", "| option | default | |", "|---|---|---|"]
+    for name, default in defaults.items():
+        shown = "" if default in (None, "", ()) or default != default else f"`{_value(default)}`"  # NaN: not set
+        lines.append(f"| `{prefix}{name}` | {shown} | {_cell(texts[name])} |")
+    return "\n".join([*lines, ""])
+
+
+def _layouts() -> str:
+    parts = [LAYOUTS.format(source=SOURCE.format("the classes in stereovox.opening"))]
+    for title, known in (("", opening.SOURCES), ("", opening.STREAMS), ("robot: ", opening.ROBOTS)):
+        for name in known:
+            doc = str(getdoc(registry.find("sources", known, name)))
+            about, *_ = re.split(r"\n\n(?:Args|Attributes|Raises):\n", doc)
+            parts.append(f"## {title}{name}\n\n```text\n{about}\n```\n")
+    return "\n".join(parts)
 
 
 def _commands() -> str:
@@ -205,34 +282,33 @@ def _is_section(kind: Any) -> bool:
 
 
 def _section(title: str, prefix: str, model: type[BaseModel]) -> str:
-    about, described = _described(model)
-    first = {text: name for name, text in reversed(described.items())}  # of settings that are described together
+    nested = {name for name, field in model.model_fields.items() if _is_section(field.annotation)}
+    about, texts = _described(model, list(model.model_fields), prefix, nested)
     lines = [f"## {title}", "", about, "", "| setting | type | default | |", "|---|---|---|---|"]
     for name, field in model.model_fields.items():
-        if not _is_section(field.annotation):
+        if name not in nested:
             default = "not set" if field.default is None else f"`{_value(field.default)}`"
-            same = first[described[name]]
-            text = described[name] if same == name else f"see `{prefix}{same}`"
-            lines.append(f"| `{prefix}{name}` | {_type(field)} | {default} | {_cell(text)} |")
+            lines.append(f"| `{prefix}{name}` | {_type(field)} | {default} | {_cell(texts[name])} |")
     return "\n".join([*lines, ""])
 
 
-def _described(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
-    """Return what a section's docstring says of the whole, and of each setting: `name: text` or `name, name: text`."""
-    text = " ".join(str(model.__doc__).replace("Attributes:\n", "").split())
+def _described(kind: type, names: list[str], prefix: str, nested: Set[str] = frozenset()) -> tuple[str, dict[str, str]]:
+    """Return what a class's docstring says of the whole, and of each of `names`: `name: text` or `name, name: text`.
+
+    nested: names that need no text. prefix: of names that are referred to, because they are described together.
+    """
+    text = " ".join(str(kind.__doc__).replace("Attributes:\n", "").split())
     text = re.sub(r"docs/(\w+)\.md", r"[\g<0>](../\1.md)", text)
     text = re.sub(r"(\w+?)1 \.\.\. \w+4:", r"\g<1>1, \g<1>2, \g<1>3, \g<1>4:", text)
-    names = "|".join(sorted(model.model_fields, key=len, reverse=True))
-    about, *entries = re.split(rf"(?<=\s)((?:{names})(?:, (?:{names}))*): ", text)
+    any_name = "|".join(sorted(names, key=len, reverse=True))
+    about, *entries = re.split(rf"(?<=\s)((?:{any_name})(?:, (?:{any_name}))*): ", text)
     said: dict[str, str] = {}
     for group, entry in zip(entries[::2], entries[1::2], strict=True):
         entry = entry.strip().rstrip(".;")
-        said |= dict.fromkeys(group.split(", "), entry[:1].lower() + entry[1:])
-    missing = [
-        name for name, field in model.model_fields.items() if name not in said and not _is_section(field.annotation)
-    ]
-    if missing:
-        raise ValueError(f"{model.__name__}: its docstring does not describe {', '.join(missing)}")
+        first, *others = group.split(", ")
+        said |= {first: entry[:1].lower() + entry[1:], **dict.fromkeys(others, f"see `{prefix}{first}`")}
+    if missing := [name for name in names if name not in said and name not in nested]:
+        raise ValueError(f"{kind.__name__}: its docstring does not describe {', '.join(missing)}")
     return about.strip(), said
 
 

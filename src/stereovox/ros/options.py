@@ -36,7 +36,7 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrid
 class Options:
     """Options of the command, and parameters of the node with the prefix `ros.`.
 
-    depth: topics of depth images; `TOPIC=INFO` where the camera_info is not next to it. cloud, scan: topics.
+    depth: topics of depth images; `TOPIC=INFO` if the camera_info is not next to it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
     poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images;
@@ -59,8 +59,8 @@ class Options:
     lidar_sigma: standard deviation of the ranges of clouds and scans in metres. lidar_min, lidar_max: metres below
     which their points are left out, and beyond which they are no surfaces (0: no limit).
     corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: whose poses they are; "":
-    that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the way since the last one.
-    reliable: request reliable delivery of images. out: where the map is saved; "": nowhere.
+    that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the path since the last one.
+    odom_frame: frame of the odometry. reliable: reliable delivery of images. out: where the map is saved; "": nowhere.
     """
 
     depth: tuple[str, ...] = ()

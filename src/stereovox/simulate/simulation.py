@@ -54,11 +54,12 @@ class Options:
     """Parameters of every simulation. A 0 that means "the scene's own" leaves the choice to the scene.
 
     axes: `world` (z up) or `optical` (Chien 2020: x right, y down, z forward, origin at the first camera).
-    frames: number of frames on the same path (0: the scene's own); noise: see `Simulation`; seed: of the noise.
+    frames: number of frames on the same path (0: the scene's own); noise: 0 for exact depth; seed: of the noise.
     camera: `simple` (noise independent from pixel to pixel, true reasons for invalid pixels), or one with realistic
-        errors: `d435`, `kinect`; see `stereovox.simulate.honest`.
+        errors: `d435`, `kinect` (docs/simulations.md).
     image_width: pixels (0: the scene's own, mostly 848; of a Kinect 640); the height follows, the field of view stays.
-    barrel, toe_in (degrees), farthest (metres, 0: the scene's own): see `D435`.
+    barrel: relative error by which the left and right borders appear too far; toe_in: degrees by which the right eye is
+        turned unnoticed; farthest: largest depth that the camera delivers, metres (0: the scene's own).
     subpixel, correlation: size of the noise, and the Gaussian that smooths it, in pixels (-1: the camera's own).
     photo: contrast of the pattern on all surfaces in a grey image taken with the depth and registered to it (0.5:
         strong, 0.05: painted walls; 0: no image).

@@ -34,13 +34,12 @@ OptionsT = TypeVar("OptionsT")
 
 @dataclass(frozen=True)
 class Options:
-    """Options behind the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
+    """Options after the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
 
     depth, info, poses: topics of the depth images, of their `sensor_msgs/CameraInfo`, and of the camera's poses, if
         they are not found or the wrong ones are.
     axes: axes of the posed body, `optical`, `ros` (x forward, z up) or `opengl` (T265); world: axes of the map, `file`,
-        `up` or `optical` (see `tracker.py`). Defaults: `opengl` and `up` for T265 poses, else `optical`
-        and `file`.
+        `up` or `optical`. Defaults: `opengl` and `up` for T265 poses, else `optical` and `file`.
     world_frame: the frame of /tf that is the world; default: `map`, else `odom`, else the root of the tree.
     pose: `fixed` for a static camera: every pose is the identity, and poses in the file are ignored.
     imu: topic of the IMU (`sensor_msgs/Imu`), if there are several; `off` for none.

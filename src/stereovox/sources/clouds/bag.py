@@ -25,7 +25,7 @@ TOPICS = {"cloud": POINT_CLOUD, "scan": LASER_SCAN}
 
 @dataclass(frozen=True)
 class Options(LidarOptions):
-    """Options of `LidarOptions`, and:
+    """Those of all clouds (`LidarOptions`), and:
 
     cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) to use
     instead. poses: topic of the lidar's poses; default: /tf. world_frame: as for depth images. deskew: 0

@@ -40,9 +40,9 @@ RATE_HZ = 10.0
 
 @dataclass(frozen=True)
 class Options(LidarOptions):
-    """Options of `LidarOptions`, and:
+    """Those of all clouds (`LidarOptions`), and:
 
-    poses: file of the poses, of any form (see `rgbd.pose_files`), instead of the folder's own. axes: axes of the
+    poses: file of the poses, of any form, instead of the folder's own. axes: axes of the
     posed body if it is not the lidar (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds per
     second, if they have no times.
     """

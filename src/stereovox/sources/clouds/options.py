@@ -22,7 +22,7 @@ OptionsT = TypeVar("OptionsT", bound="LidarOptions")
 
 @dataclass(frozen=True)
 class LidarOptions:
-    """Options behind the name of any recording with clouds, as in `scans?range_max=80&sigma=0.03`.
+    """Options after the name of any recording with clouds, as in `scans?range_max=80&sigma=0.03`.
 
     sigma: standard deviation of a range in metres (0: 0.02). range_min: metres below which points are left out, such
     as points on the vehicle (-1: 0.5). range_max: metres beyond which a point is no surface (0: no limit).

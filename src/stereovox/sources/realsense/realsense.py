@@ -35,7 +35,7 @@ PREFERRED = (848, 480, 30)
 class Options:
     """Options after the name, as in `realsense:?width=848&height=480&fps=30`; 0 or -1: the camera's own.
 
-    width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
+    width, height: pixels. fps: frames a second. emitter: 0 off, 1 on. laser_power: milliwatts (D435: 0 to 360).
     baseline: metres between the two infrared cameras, if the camera does not report it. pose: `fixed` for a camera
     at rest; every pose is then the identity. imu: `off` to leave gyroscope and accelerometer out. photo: `off` to leave
     the colour camera out.

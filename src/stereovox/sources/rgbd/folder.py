@@ -48,15 +48,14 @@ class ImageFile(NamedTuple):
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """Options behind a folder's name, as in `scan?depth_scale=1000&poses=trajectory.log`.
+    """Options after a folder's name, as in `scan?depth_scale=1000&poses=trajectory.log`. File names are searched
+    as given, then inside the folder.
 
-    depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: the layout's, checked against
-        the poses). camera: file of the camera, instead of the layout's own (see `camera_in`). fps: images a second
-        if they have no times (0: the layout's). poses: file or folder of poses instead of the layout's own (see
-        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward), `ros` or
-        `ned`. invert: whether poses are world to camera. poses_scale: metres per unit of the poses' positions (0.001:
-        millimetres).
-    File names are searched as given, then inside the folder.
+    depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: the layout's, checked against the poses).
+    camera: file of the camera, instead of the layout's own. fps: images a second if they have no times (0: the
+    layout's). poses: file or folder of poses, of any form, instead of the layout's own. axes: axes of the posed
+    camera, `optical`, `opengl` (x right, y up, z backward), `ros` or `ned`. invert: whether poses are world to camera.
+    poses_scale: metres per unit of the poses' positions (0.001: millimetres).
     """
 
     depth_scale: float = 0.0

@@ -26,14 +26,14 @@ class PairSettings:
 
     depth: folder or file of the depth images, relative to the file's own folder.
     poses: text file of the tracker, lines `stamp tx ty tz qx qy qz qw [confidence]`, or a bag with poses.
-    axes: axes of the poses in that file, `opengl` (T265), `optical` or `ros`; world: axes of the map, `up` (z up),
-        `optical` (Chien 2020) or `file` (see `tracker.py`).
+    axes: axes of the poses in that file, `opengl` (T265), `optical`, `ros` or `ned`; world: axes of the map, `up`
+        (z up), `optical` (Chien 2020) or `file`.
     T_tracker_camera: (4, 4) metres; maps the depth camera's optical frame into the tracker's body frame, both in
         optical axes (x right, y down, z forward), whatever `axes` is; None: unknown.
     clock_offset_s, clock_rate: depth stamp = tracker stamp + offset + (rate - 1) * (tracker stamp - the first one).
     min_confidence: poses below it are not used (if the file has a confidence).
     max_speed_mps, max_turn_dps: poses further apart than this speed allows are a jump.
-    depth_scale: metres per unit of the images, baseline: metres; None: the depth source's.
+    depth_scale: metres per unit of the images; baseline: metres; without them, the depth source's.
     """
 
     depth: str = "."

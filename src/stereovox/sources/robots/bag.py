@@ -34,7 +34,7 @@ T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """Options behind the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
+    """Options after the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
 
     scan, depth, info, odom, truth: topics of scans (or point clouds), depth images, their CameraInfo, odometry
         (nav_msgs/Odometry, instead of tf) and true poses of the robot, if they are not found or the wrong ones are.
@@ -43,7 +43,8 @@ class RobotOptions:
         roll in radians, of which the last may be left out. A camera without rotation points forward.
     axes: `ros` if depth images name the camera's body (x forward) as their frame, not its optical frame.
     scale: metres per unit of depth (0: the file's). range_max: metres, instead of the scans' own.
-    max_gap, extrapolate: seconds, see `tf.Limits`.
+    max_gap: seconds, the longest gap in tf that is bridged; extrapolate: seconds for which its first and last transform
+        hold.
     lowest, highest: metres above the floor between which points of a cloud count.
     """
 

@@ -73,7 +73,7 @@ class CarmenLog:
 
 @dataclass(frozen=True)
 class Options:
-    """Options behind the file's name, as in `aces.clf.bz2?max_range=40`.
+    """Options after the file's name, as in `aces.clf.bz2?max_range=40`.
 
     max_range: metres from which a range means "no echo"; 0: the file's, else found from its ranges: the smaller
         of 50 m and 81.9 m (a SICK's "no echo") that the log uses.

@@ -185,10 +185,10 @@ class Mapper(Aged):
         refused are not judged again. Other threads may add frames and read the map meanwhile; it changes at once. The
         gate compares the next frames of a sensor with the corrected pose of its last one.
 
-        Where `map.frames_budget` did not hold all frames, the map is made of those that are kept.
+        If `map.frames_budget` did not hold all frames, the map is made of those that are kept.
 
         Args:
-            poses: T_world_sensor (4, 4) by the frame's stamp in nanoseconds, or by sensor and stamp where several
+            poses: T_world_sensor (4, 4) by the frame's stamp in nanoseconds, or by sensor and stamp if several
                 frames have it. Poses of frames that are not kept, such as refused ones, are ignored and counted.
 
         Returns:

@@ -235,7 +235,7 @@ def _depth_of(where: str) -> DepthSource:
 
 
 def _images_alone(where: str) -> DepthSource:
-    """Return depth images without poses; raises SourceError if there are none."""
+    """Return depth images without poses; raises SourceError if missing."""
     for kind in _image_classes():
         if kind.recognises(where):
             return kind(where)

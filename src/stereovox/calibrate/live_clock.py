@@ -121,7 +121,7 @@ class MotionClock:
         return True
 
     def _misfits(self, shifts: NDArray[np.int64], first_ns: int, last_ns: int) -> tuple[NDArray[np.float64], float]:
-        """Return squared misfits (shifts, pairs), NaN where no poses are near, and how much the camera moved."""
+        """Return squared misfits (shifts, pairs), NaN if no poses are near, and how much the camera moved."""
         from scipy.spatial.transform import Rotation
 
         observed = np.array([T for _, _, T in self._pairs])

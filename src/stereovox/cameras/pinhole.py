@@ -235,7 +235,7 @@ class PinholeCamera:
             depth_m: (height, width) metres along the optical axis; NaN: no value.
 
         Returns:
-            (height, width, 3) float64 metres in the optical frame; NaN where the depth is NaN.
+            (height, width, 3) float64 metres in the optical frame; NaN if the depth is NaN.
         """
         depth = np.asarray(depth_m, float)
         v, u = np.mgrid[: self.height, : self.width]

@@ -47,7 +47,7 @@ class LoopClosure:
         anchors: (S,) int64, indices of the frames in the middle of all places.
         report: Report of the map's correction.
         odometry: The second odometry, and the number of steps it helped; None if missing.
-        positions: The drift-free positions, and the number of places that agree with them; None if there are none.
+        positions: The drift-free positions, and the number of places that agree with them, or None.
         sensors: Sensor of each of the N frames; empty if there is only one.
     """
 

@@ -56,7 +56,7 @@ def _recording(path: str) -> Description:
 
 
 def _images(path: str) -> Description | None:
-    """Describe depth images without poses; None if there are none."""
+    """Describe depth images without poses, or None."""
     try:
         found = survey(open_images(path))  # pyright: ignore[reportArgumentType] - it can be read in any order
     except StereovoxError:

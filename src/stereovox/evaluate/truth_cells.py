@@ -43,7 +43,7 @@ class CellReader:
         self._place = (of_cell << 9) | (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
 
     def log_odds(self, voxel_map: VoxelMap) -> NDArray[np.float32]:
-        """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 where unobserved."""
+        """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 if unobserved."""
         return voxel_map.storage.cell_format.log_odds(self.stored(voxel_map))
 
     def stored(self, voxel_map: VoxelMap) -> NDArray[np.integer]:

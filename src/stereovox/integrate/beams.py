@@ -65,8 +65,8 @@ class Beams:
 
         A range from `range_min` to min(`range_max`, `config.max_range`) is a hit: its beam is free up to it, and
         occupied from it to `grid.thickness` behind. +inf, and a hit beyond `config.max_range`, is free up to that
-        minimum. Other ranges give no evidence. Where the scan has `clear`, that is how far its beams are free,
-        and `clear_from` from where. A beam never clears the cell it hits. Where the sensor leans, lengths are as seen
+        minimum. Other ranges give no evidence. If the scan has `clear`, that is how far its beams are free,
+        and `clear_from` from where. A beam never clears the cell it hits. If the sensor leans, lengths are as seen
         from above.
         The memory of the evidence is reused by the next call.
         Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
@@ -113,7 +113,7 @@ class Beams:
         return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], ends, box
 
     def _directions_of(self, scan: Scan) -> NDArray[np.float64]:
-        """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""
+        """Return cosine and sine (N, 2) of each beam; those of the scan before, if it had the same angles."""
         seen = float(scan.angle_min), float(scan.angle_step), len(scan.ranges)
         if seen != self._seen:
             if not np.isfinite(seen[0] + seen[1] * seen[2]):

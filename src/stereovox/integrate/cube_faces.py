@@ -30,7 +30,7 @@ class Face(NamedTuple):
     """The part of one side of the cube that the wide camera sees.
 
     T_wide_face: (4, 4) maps its optical frame into the wide camera's. pixel: (height, width) index of the wide image's
-    pixel, -1 where it sees none. scale: (height, width) depth along the face's axis over depth of the wide camera.
+    pixel, -1 if it sees none. scale: (height, width) depth along the face's axis over depth of the wide camera.
     """
 
     camera: PinholeCamera
@@ -152,13 +152,13 @@ def _face(camera: WideCamera, pinhole: PinholeCamera, forward: NDArray[np.float6
 
 
 def _rotation(forward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a rotation whose z axis is `forward`, and whose x axis is the wide camera's where it can be."""
+    """Return a rotation whose z axis is `forward`, and whose x axis is the wide camera's if it can be."""
     right = np.array([0.0, 0, -1]) * forward[0] if forward[0] else np.array([1.0, 0, 0])
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
 def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return the index of the pixel that looks in each direction (..., 3), -1 where none does."""
+    """Return the index of the pixel that looks in each direction (..., 3), -1 if none does."""
     if isinstance(camera, SphericalCamera):
         u = np.arctan2(directions[..., 0], across) / camera.step_u + camera.cu
     else:

@@ -2,7 +2,7 @@
 """The projective integrator on a graphics card: evidence is made and stays there, cell for cell that of `projective`.
 
 Pinhole cameras only. Per frame the depth image and the view go to the card, and some numbers of blocks come back.
-Imported only where `device = "cuda"`.
+Imported only if `device = "cuda"`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class GpuEye:
         launch(_gpu.passed, view, self._table, origin, hits.table, hits.coords, *free)
 
     def _has_room(self, counts: NDArray[np.int32]) -> bool:
-        """Return whether all lists were long enough; where not, make them longer, for another try."""
+        """Return whether all lists were long enough; if not, make them longer, for another try."""
         most = int(counts[[_gpu.LARGE, _gpu.MIDDLE, _gpu.SEEN_FREE, _gpu.SEEN_MIXED]].max())
         hit_blocks, room, hit_room = int(counts[_gpu.HIT_BLOCKS]), len(self._free), len(self._hits.coords)
         if most > room:

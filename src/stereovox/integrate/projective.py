@@ -296,7 +296,7 @@ def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
 def strongest(parts: Sequence[Evidence]) -> Evidence:
     """Return one frame's evidence: a cell keeps the strongest, positive before negative, of all `parts`.
 
-    Blocks that are wholly free in one part alone stay uniform; they are expanded where another part has the block too.
+    Blocks that are wholly free in one part alone stay uniform; they are expanded if another part has the block too.
     """
     if len(parts) == 1:
         return parts[0]

@@ -95,7 +95,7 @@ class Ray:
         return camera.focal_px / camera.binning * self._config.voxel_size
 
     def _of_countable_rays(self, image: DepthImage) -> DepthImage:
-        """Return the image, or its block minima where the weight of one ray would be too small to count."""
+        """Return the image, or its block minima if the weight of one ray would be too small to count."""
         cell_px = self._cell_px(image.camera)
         if self._config.ray.update != "every" or cell_px <= MAX_CELL_PX:
             return image
@@ -114,7 +114,7 @@ class Ray:
         return OBLIQUE * metres / self._config.voxel_size
 
     def _in_time(self, image: DepthImage) -> DepthImage:
-        """Return the image, or its block minima where its rays would cross too many cells for the deadline.
+        """Return the image, or its block minima if its rays would cross too many cells for the deadline.
 
         Raises FrameRefused `no_time` for a camera whose pixels cannot be put together.
         """
@@ -228,7 +228,7 @@ class Lanes(NamedTuple):
     hit: Keys  # key of the cell that holds the measured point, -1 without one
     cell: Keys  # key of the cell the ray goes into next
     key: Keys  # key of the cell that is given evidence in this step
-    middle: Floats  # depth in the middle of the ray's way through it, NOWHERE for no evidence
+    middle: Floats  # depth in the middle of the ray inside it, NOWHERE for no evidence
     place: Ints  # where this stands in the sensor table, then the number there
     passed: Ints  # the same for the largest loss
     gain: Ints  # and the evidence

@@ -99,7 +99,7 @@ class KernelTable(NamedTuple):
 class Rays(NamedTuple):
     """The rays of any camera at its pose, in metres relative to the corner of the block it stands in.
 
-    Where the sides of a cell differ, the world is stretched to make cells cubes of `voxel_size`; depths stay metres.
+    If the sides of a cell differ, the world is stretched to make cells cubes of `voxel_size`; depths stay metres.
     """
 
     forward: NDArray[np.float32]  # (3, 3) camera to world, transposed: row a is the camera's axis a in the world
@@ -267,7 +267,7 @@ def _fitting_blocks(camera: VirtualCamera) -> int:
 def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
     """Return whether cells that a camera sees at depths up to `reach` metres need keys of 64 bits.
 
-    Raises FrameRefused `bad_camera` where these do not suffice either.
+    Raises FrameRefused `bad_camera` if these do not suffice either.
     """
     cells = farthest_cells(camera, reach, config)
     if cells >= 1 << (_cells.WIDE - 1):

@@ -33,7 +33,7 @@ from stereovox.sources.poses.live_poses import LivePoses
 GRID_S = 1.0
 """Seconds between two writes of the 2-D map."""
 STEP_DEG = 2.0
-"""Width of a cell of the spherical grid where the settings do not choose one."""
+"""Width of a cell of the spherical grid if the settings do not choose one."""
 
 
 class Output(Protocol):
@@ -147,14 +147,14 @@ class LiveSphere:
     """The distances to the nearest surfaces in all directions from the body, by the last image of each camera.
 
     Args:
-        config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees where they say nothing.
+        config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees if they say nothing.
         mounts: T_body_camera (4, 4) by the name of the sensor; body x forward, y left, z up.
         picture: PNG to draw at the end; None: none.
         mapper: The mapper that takes the images; None: how old they are is not judged.
         poses: Where newer poses of the body come from; None: those of the images are the newest.
 
     Attributes:
-        failure: Why there is no picture, where one was asked for; "" when there is.
+        failure: Why there is no picture, if one was requested; "" when there is.
 
     Raises:
         StereovoxError: The picture cannot be written.

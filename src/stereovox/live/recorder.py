@@ -36,8 +36,8 @@ class Recorder:
 
     Topics: `/NAME/depth/image_rect_raw` and `camera_info` next to it, `/tf` (odom to base_link at the time of each
     image
-    that has a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` where pictures are taken
-    along, and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or float metres where the source has
+    that has a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` if pictures are taken
+    along, and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or float metres if the source has
     these. Images that the map refused are recorded, too.
 
     Args:
@@ -45,7 +45,7 @@ class Recorder:
             `FILE.mcap.XXXXXX.unfinished/`, from where it can be read after a kill or a full disk.
         mounts: T_body_camera (4, 4) by the name of the sensor.
         imus: IMUs by the name of the sensor.
-        notify: Called with a line where something cannot be recorded.
+        notify: Called with a line if something cannot be recorded.
 
     Attributes:
         counts: `images` that are recorded, `skipped`: that came while too many waited, `unsuitable`: other than whole

@@ -117,7 +117,7 @@ def read_live(path: str | Path) -> LiveSetup:
 
 
 def check_cameras(cameras: Sequence[LiveCamera]) -> tuple[LiveCamera, ...]:
-    """Return the cameras; raises SourceError if there is none, too many, or two of one name."""
+    """Return the cameras; raises SourceError if missing, too many, or two of one name."""
     names = [camera.title for camera in cameras]
     if not 1 <= len(names) <= MAX_CAMERAS:
         raise SourceError(f"{len(names)} cameras; give 1 to {MAX_CAMERAS}")

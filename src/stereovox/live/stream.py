@@ -114,7 +114,7 @@ class LiveStream(Stream):
     Args:
         cameras: The cameras.
         poses: `given`: those of the images; `track`: the first camera is tracked by its own images, and the others
-            move with it; or a stream of poses of the body, or a buffer that you fill. None: given where all images
+            move with it; or a stream of poses of the body, or a buffer that you fill. None: given if all images
             have poses, else track.
         wait_s: Seconds that an image waits for its pose.
         seconds: How long to go on; None: until the cameras end.

@@ -340,7 +340,7 @@ def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
 
 def _points(image: DepthImage, v: NDArray[np.integer], u: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return the points (..., 3) of pixels, NaN where they have no depth."""
+    """Return the points (..., 3) of pixels, NaN if they have no depth."""
     columns, rows = (rays.astype(float) for rays in image.camera.rays())
     depth = np.where(np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], np.nan)
     return np.stack([columns[u], rows[v, 0], rows[v, 1]], axis=-1) * depth[..., None]

@@ -57,7 +57,7 @@ class Deadline:
         return self._levels[self._scheduler.level]
 
     def expect(self, frame: AnyFrame) -> None:
-        """Begin to prepare the next frame, where its level is known by now."""
+        """Begin to prepare the next frame, if its level is known by now."""
         if self._scheduler is None:
             self._levels[0].prepare.begin(frame)
 
@@ -91,7 +91,7 @@ class DepthStage(Protocol):
 class Prepared(NamedTuple):
     """A frame ready for the integrator, and the milliseconds that took."""
 
-    frame: Frame | Cloud  # with its depth, where that had to be matched
+    frame: Frame | Cloud  # with its depth, if that had to be matched
     image: AnyImage
     match_ms: float
     depth_ms: float
@@ -165,7 +165,7 @@ class Levels:
 class NearDepth:
     """Depth images up to `near` metres, `stride` by `stride` pixels merged into one; wide cameras keep all pixels.
 
-    A pixel beyond is TOO_FAR only where its noise cannot have put it there; otherwise it has no value.
+    A pixel beyond is TOO_FAR only if its noise cannot have put it there; otherwise it has no value.
     """
 
     def __init__(self, config: Config, near: float, stride: int):

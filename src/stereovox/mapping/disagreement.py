@@ -12,7 +12,7 @@ from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, DisagreementSpell, History, RunningMean
 
 DISAGREES, CONTRADICTS, CAMERA_MOVED = "disagrees_with_map", "contradicts_map", "camera_moved"
-"""Refusal reasons: while a doubt is young, once it has lasted for `trust.changed_s`, and where another pose fits."""
+"""Refusal reasons: while a doubt is young, once it has lasted for `trust.changed_s`, and if another pose fits."""
 USUAL_AT_FIRST, USUAL_GAIN = RunningMean(0.25, 0.06), 0.2
 """Disagreement assumed of a new sensor, and the weight of each frame in the exponential mean."""
 SPREADS = 4

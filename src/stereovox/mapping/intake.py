@@ -108,7 +108,7 @@ class Aged:
 
 
 class PendingFrame:
-    """A frame on its way into the map. While it is entered, others wait; a FrameRefused inside the block ends there.
+    """A frame that enters the map. While it is entered, others wait; a FrameRefused inside the block ends there.
 
     Attributes:
         report: What became of the frame: set by the mapper, or on exit where the frame was refused.

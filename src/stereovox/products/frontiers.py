@@ -104,7 +104,7 @@ def write_frontiers(found: Sequence[Frontier], path: str | Path) -> None:
     """Write frontiers for `numpy.load`.
 
     Arrays: `cells` (N, 3) int32, `frontier` (N,) int32, the index of each cell's frontier; `centroid` (K, 3) and
-    `look_from` (K, 3) in metres, NaN if there is none. Raises MapFileError if the file cannot be written.
+    `look_from` (K, 3) in metres, NaN if missing. Raises MapFileError if the file cannot be written.
     """
     no_viewpoint = np.full(3, np.nan)
     with replacing(path) as file:

@@ -374,13 +374,13 @@ def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
 
 
 def _ranges(cloud: Cloud) -> NDArray[np.float64]:
-    """Return a sample of a cloud's ranges in metres, NaN if there is none."""
+    """Return a sample of a cloud's ranges in metres, NaN if missing."""
     ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
     return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
 
 
 def _depth_m(frame: Frame) -> NDArray[np.float64]:
-    """Return a sample of an image's depths in metres, NaN if there is none."""
+    """Return a sample of an image's depths in metres, NaN if missing."""
     step = max(1, frame.depth.shape[1] // 160)
     depth = frame.depth[::step, ::step].astype(np.float64)
     depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan

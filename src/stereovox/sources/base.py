@@ -155,7 +155,7 @@ class Source(Stream):
         return len(self)
 
     def after(self, count: int) -> Stream:
-        """Return the frames from number `count` on; raises SourceError if there are none."""
+        """Return the frames from number `count` on; raises SourceError if missing."""
         return Selection(self, f"{count}:")
 
     def gravity(self) -> NDArray[np.float64] | None:

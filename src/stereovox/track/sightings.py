@@ -125,7 +125,7 @@ class Sightings:
         return better.those((squares < USUAL) & (better.looks < MAX_AGE))
 
     def agreed(self, expected: Transform) -> Transform | None:
-        """Return the pose that most landmarks agree on (PnP, RANSAC), from `expected`; None if there is none."""
+        """Return the pose that most landmarks agree on (PnP, RANSAC), from `expected`, or None."""
         near = self.corners.inverse > NEAR * self.deviation
         if near.sum() < AGREED:
             return None

@@ -30,7 +30,7 @@ TURNED_M = 2.0
 
 
 class View(NamedTuple):
-    """The depths of one image. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN if there is none.
+    """The depths of one image. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN if missing.
 
     nearest: the least depth in each place of the grid and its neighbours, infinity if none. points: (N, 3)
     float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half

@@ -41,7 +41,7 @@ class Odometry:
             stamps_ns: The times.
             motion: (4, 4) by the frames' poses.
             covariance: (6, 6) of that.
-            way: Its total path in metres and radians.
+            way: Its length in metres and radians.
 
         Returns:
             (4, 4) and (6, 6): as given if this odometry has no pose near one of the times; if the two contradict each

@@ -66,7 +66,7 @@ class Positions:
         """Return places (M, 3) turned about the vertical and shifted for the best fit.
 
         Args:
-            found: (M, 3) places, NaN if there is none.
+            found: (M, 3) places, NaN if missing.
             anchors: (M, 3) the map's positions of them.
             R_level_map: (3, 3) turns the map so that z points up.
 
@@ -102,7 +102,7 @@ class Positions:
         return {"used": self.used, "contradicted": self.contradicted}
 
     def _check(self, found: NDArray[np.float64]) -> None:
-        """Raise StereovoxError if places (M, 3), NaN if there is none, are too few or too close to each other."""
+        """Raise StereovoxError if places (M, 3), NaN if missing, are too few or too close to each other."""
         known = found[np.isfinite(found).all(axis=1)]
         span = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
         if len(known) < LEAST or span < WIDE * self.sigma_m:

@@ -71,7 +71,7 @@ class CellErrors:
     eq7_coverage_percent, eq7_contradiction_percent: its two parts, which sum to it: cells that only one of the maps
         knows (missed, extra), and cells with different known states (wrongly occupied, wrongly free).
     eq7_outside_percent: the same as Eq 7 without excluded cells in the denominator; never less.
-    known_error_percent: share that differ of the cells known to both maps; None if there are none.
+    known_error_percent: share that differ of the cells known to both maps; None if no cell is.
     missed, wrongly_occupied, wrongly_free, extra: the cells that differ, see `Difference`; forgiven: those that differ
         in excluded regions and do not count.
     reference_occupied, reference_free: all such cells of the reference, including excluded ones.

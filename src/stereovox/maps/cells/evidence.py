@@ -21,7 +21,7 @@ class GridEvidence:
     values: (n, 4096) int16 or int32; cell (column, row) of a tile is at `64 row + column`. Zero if the scan says
         nothing.
     ends: (N, 6) of each beam of the scan from where and up to where it clears, and where it hits, x and y in cells of
-        the grid; NaN for nothing. None where it is not known.
+        the grid; NaN for nothing. None if unknown.
     """
 
     coords: NDArray[np.int32]

@@ -27,7 +27,7 @@ from stereovox.maps.record.camera_path import StampedPose
 LEVEL = 1
 """Of zstd: higher ones take twice as long for less than a twentieth of the bytes."""
 SPACING_M = 0.05
-"""Least way in metres between two frames once not all can be kept; half as many as radians it may turn."""
+"""Least path length in metres between two frames once not all can be kept; half as many as radians it may turn."""
 SPARSEST_M = 1e6
 """Where frames this far apart need too much memory, the budget is for fewer than one frame."""
 DTYPES = {"uint16": np.uint16, "float32": np.uint32, "float64": np.uint32}
@@ -224,7 +224,7 @@ class KeptFrames:
     sensor has moved or turned far enough since the last one that is, and how far that is doubles whenever it must.
 
     Attributes:
-        spacing: Least way in metres between two kept frames of a sensor; 0 while all are kept.
+        spacing: Least path length in metres between two kept frames of a sensor; 0 while all are kept.
     """
 
     def __init__(self, budget: int | None = None, frames: Iterable[KeptFrame] = (), spacing: float = 0.0):

@@ -36,7 +36,7 @@ class FloorHeights:
 
     Attributes:
         height: (rows, columns) float32, metres along the map's `up` from the world's origin, of the nearest observed
-            floor. NaN if there is none at all.
+            floor. NaN if there is no floor.
         away: (rows, columns) float32, horizontal metres to that floor; 0 if observed here, infinite if free space lies
             deeper, as beyond the edge of a drop.
         resolution: Side of a cell in metres.

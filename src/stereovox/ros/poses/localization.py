@@ -55,7 +55,7 @@ class Located(NamedTuple):
 
 
 class Localization(Protocol):
-    """A way to find out where the robot is."""
+    """A method to find the pose of the robot."""
 
     def add(self, scan: Scan) -> Located:
         """Return where the robot is after one more scan; raises FrameRefused for one that cannot be trusted."""

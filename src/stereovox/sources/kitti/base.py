@@ -30,7 +30,7 @@ class CameraPoses(Protocol):
     """Poses of camera 0 for each frame; see `kitti.poses`."""
 
     def at(self, i: int) -> Transform:
-        """Return T_world_cam0 (4, 4); raises FrameRefused if there is none."""
+        """Return T_world_cam0 (4, 4); raises FrameRefused if missing."""
         ...
 
 
@@ -127,7 +127,7 @@ class KittiSource(Source, ABC):
 
 
 def time_lines(path: Path, whose: str) -> list[str]:
-    """Return the stripped lines of a file of times; raises SourceError if there is none."""
+    """Return the stripped lines of a file of times; raises SourceError if missing."""
     try:
         lines = read_text(path, MAX_LIST, "replace").rstrip().splitlines()
     except OSError as error:

@@ -55,7 +55,7 @@ def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[
 
 
 def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
-    """Return the lines of a file of poses in order of time; raises SourceError if there is none or a stamp is
+    """Return the lines of a file of poses in order of time; raises SourceError if missing or a stamp is
     missing."""
     lines = sorted(stamped_lines(path), key=lambda line: line[0])
     if not lines:

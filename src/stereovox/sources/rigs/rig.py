@@ -84,7 +84,7 @@ class RigSource(Source, ABC):
         return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if there is none."""
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused if missing."""
         shot = self._shots[range(len(self))[i]]
         return self._pose(shot, self.pairs[shot.pair])
 

@@ -24,7 +24,7 @@ BESIDE = 0.1
 class Drawn:
     """A map whose third axis points up.
 
-    cells: (N, 3) int32 known cells; state: (N,) uint8 of `State`; path: camera positions (M, 3) in metres, NaN where
+    cells: (N, 3) int32 known cells; state: (N,) uint8 of `State`; path: camera positions (M, 3) in metres, NaN if
     the line breaks, or None; names: the map's own names of the three axes.
     """
 

@@ -21,7 +21,7 @@ USUAL = PinholeCamera.from_field_of_view(848, 480, 91.2, 0.05)
 
 
 def known_viewpoint(viewpoint: Viewpoint | None) -> Viewpoint:
-    """Return `viewpoint`; raises StereovoxError if there is none."""
+    """Return `viewpoint`; raises StereovoxError if missing."""
     if viewpoint is None:
         raise StereovoxError("the map has no camera pose; give one: --eye=X,Y,Z --toward=X,Y,Z")
     return viewpoint

@@ -26,7 +26,7 @@ NOT_APART = "one drive alone, which cannot be cut in two; add another drive"
 class Apart:
     """A map, and the scores for claims. All by the kind of truth, `view` and `rays`.
 
-    chosen: precision and recall on the part for choosing thresholds; None if there is none. scored: scores of the
+    chosen: precision and recall on the part for choosing thresholds, or None. scored: scores of the
     rest, on which thresholds are never chosen. where: both parts, in words.
     """
 

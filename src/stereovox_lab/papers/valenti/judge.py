@@ -48,7 +48,7 @@ class ScoreSeries:
         return result
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return `frame` (F,) int64 and each measure by name (F,) float64, NaN where it has no value.
+        """Return `frame` (F,) int64 and each measure by name (F,) float64, NaN if it has no value.
 
         Names of measures over observed cells alone begin with `observed_`.
         """

@@ -8,7 +8,7 @@
 WORD=VALUE replaces a word of the command when it runs (`RECORDING=...`); the file keeps the word. Programs that know
 `--json` get it. An entry has `command`, `machine`, `date`, `find`, and `values`. `find` says what to take from the
 output: `{"name": "PATH"}` in the JSON of the last line (`cpu_ms.p99`, `rows[library=stereovox].ms`; `rows[*].ms` takes
-all, and `{key}` in the name is filled in from each), or `{"name": "PATTERN"}` with one group in other text. A name
+all, and `{key}` in the name is filled in from each), or `{"name": "PATTERN"}`, with a (group), in text. A name
 that is found several times becomes a list. figures.md.in is the page with the values' names in place of figures.
 """
 
@@ -154,7 +154,7 @@ def found(printed: str, find: Mapping[str, str]) -> dict[str, Any]:
         return data if isinstance(data, dict) else {}
     values: dict[str, list[Any]] = {}
     for name, place in find.items():
-        matches = _by_pattern(name, place, printed) if data is None else _by_path(name, place, data)
+        matches = _by_pattern(name, place, printed) if "(" in place else _by_path(name, place, data)
         if not matches:
             raise SystemExit(f"{name}: the output has no {place}")
         for key, value in matches:

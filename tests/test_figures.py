@@ -116,6 +116,8 @@ def test_every_result_is_on_the_page_with_its_command():
         assert result.values
         assert result.machine
         assert result.date
+        assert {key for key in result.find if "{" not in key} <= set(result.values), name
+        assert all(re.compile(place).groups == 1 for place in result.find.values() if "(" in place), name
         assert f"{{{name}[" in template or f"{{{name}." in template, name
     assert not [number for text in parts(template) for number in measured(text) if digits(number) > 2]
 
@@ -157,7 +159,7 @@ def test_a_new_command_and_text_and_status(file, tmp_path, capsys):
     results.measure("a", {}, f"{sys.executable} {program}", file)
     assert results.load(file)["a"].values == {"cells": 1234, "ms": [0.25, 0.5]}
     assert "status 1" in capsys.readouterr().err
-    file.write_text(json.dumps({"a": {"command": "old", "machine": "", "date": "", "find": {"x": "there is none"}}}))
+    file.write_text(json.dumps({"a": {"command": "old", "machine": "", "date": "", "find": {"x": "rows[*].ms"}}}))
     before = file.read_text()
     for name, replaced in (("a", "x: the output has no"), ("b", "b: nothing to record")):
         with pytest.raises(SystemExit, match=replaced):

@@ -159,7 +159,7 @@ def open_camera(path_or_name: str | os.PathLike[str]) -> Stream:
 
 
 def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
-    """Open a source as `open_source` does, or a live camera, but without poses where it can do without them.
+    """Open a source as `open_source` does, or a live camera, but without poses if it can do without them.
 
     Args:
         path_or_name: As for `open_source`, or the name of a live camera (`realsense:`); needs no poses.

@@ -114,7 +114,7 @@ class _Parser(argparse.ArgumentParser):
         raise StereovoxError(f"{message}{self._minus_hint(message)}; see: {self.prog} --help")
 
     def _minus_hint(self, message: str) -> str:
-        """Return a hint on how to write a value that begins with a minus, where that is the mistake."""
+        """Return a hint on how to write a value that begins with a minus, if that is the mistake."""
         option = message.partition(":")[0].split("/")[-1].removeprefix("argument ")
         for word, value in pairwise(self._words):
             if word == option and value.startswith("-") and value.removeprefix("--") not in self.options:

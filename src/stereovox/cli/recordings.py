@@ -41,7 +41,7 @@ def add_recordings(parser: ArgumentParser) -> None:
 
 
 def check_outputs(out: str, report: str | None = None) -> None:
-    """Raise StereovoxError before the work where a result could not be written or `out` does not end in .toml."""
+    """Raise StereovoxError before the work if a result could not be written or `out` does not end in .toml."""
     if Path(out).suffix != ".toml":
         raise StereovoxError(f"--out {out}: give a name that ends in .toml")
     if os.path.isdir(out):

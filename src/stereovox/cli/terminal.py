@@ -117,7 +117,7 @@ class FrameProgress:
 
 
 def first_included(result: dict[str, Any]) -> str:
-    """Return a remark on times in a summary where they are those of a single frame, the first; else nothing."""
+    """Return a remark on times in a summary if they are those of a single frame, the first; else nothing."""
     return " (a single frame: loading or compiling the kernels included)" if result["frames"] == 1 else ""
 
 

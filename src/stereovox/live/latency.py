@@ -17,7 +17,7 @@ STAMP, ARRIVAL = "stamp", "arrival"
 
 
 class Latency:
-    """Milliseconds from the stamp of each image that was mapped, or where that is by another clock, its arrival.
+    """Milliseconds from the stamp of each image that was mapped, or if that is by another clock, its arrival.
 
     Args:
         moment: Returns when the newest image was taken and arrived.

@@ -78,7 +78,7 @@ class Aged:
         A function: returns the present time by that clock in nanoseconds, None while it is not known. "live": stamps
         advance with the time, by a clock of this machine, which is recognised, or by another, of which the least delay
         that was seen is taken for none. "replay": stamps are those of a recording, played at any speed; ages count from
-        the newest stamp. None: a clock of this machine where it is recognised, else as "replay", until an
+        the newest stamp. None: a clock of this machine if it is recognised, else as "replay", until an
         `ObstacleSender` makes it "live". Setting it raises ConfigError for anything else.
         """
         return self._intake.monitor.stamps.by
@@ -111,7 +111,7 @@ class PendingFrame:
     """A frame that enters the map. While it is entered, others wait; a FrameRefused inside the block ends there.
 
     Attributes:
-        report: What became of the frame: set by the mapper, or on exit where the frame was refused.
+        report: What became of the frame: set by the mapper, or on exit if the frame was refused.
     """
 
     __slots__ = ("_arrived_ns", "_frame", "_intake", "report")

@@ -295,7 +295,7 @@ class Rebuild:
         return bool(((coords >= low) & (coords < high)).all(axis=1).any())
 
     def _expect(self, frame: KeptFrame | None) -> None:
-        """Begin to prepare the frame that will be mapped next, where there is a thread for it."""
+        """Begin to prepare the frame that will be mapped next, if there is a thread for it."""
         if frame is not None and self._storage.config.threads > 1:
             self._loaded.begin(frame)
 

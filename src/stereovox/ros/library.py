@@ -38,7 +38,7 @@ def running_node(arguments: Sequence[str], make: Callable[..., Any] | None = Non
 
 
 def check_installed() -> None:
-    """Raise MissingExtra, one line, where a required package is not installed."""
+    """Raise MissingExtra, one line, if a required package is not installed."""
     for package in REQUIRED:
         try:
             import_module(package)

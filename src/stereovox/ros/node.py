@@ -133,7 +133,7 @@ class MapNode:
     def close(self) -> dict[str, Any]:
         """Map all waiting frames, correct the map as was asked, publish the final one; return figures for the report.
 
-        Keys: `localisation`, `slam`, `slam_map` (an OccupancyGrid), `error`; each where there is such a thing.
+        Keys: `localisation`, `slam`, `slam_map` (an OccupancyGrid), `error`; each if there is such a thing.
         """
         while (arrival := self.waiting.pop(lambda one: True)) is not None:
             self._map(arrival)

@@ -131,7 +131,7 @@ class NodeRun(Run[None, dict[str, Any]]):
                 result["out"] = self._out()
             elif self._out():
                 self._notify("no frame could be used: no map is written")
-        finally:  # SLAM's map is kept where the other one cannot be
+        finally:  # SLAM's map is kept if the other one cannot be
             if grid is not None and self._topics.slam_out:
                 write_map_server(grid, self._topics.slam_out)
                 self._notify(f"SLAM's map is saved in {self._topics.slam_out}")

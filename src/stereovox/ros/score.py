@@ -55,7 +55,7 @@ class Score:
         return {} if self._last is None else self._values(self._last)
 
     def update(self) -> None:
-        """Publish a score that is ready, and begin the next one where it is due."""
+        """Publish a score that is ready, and begin the next one if it is due."""
         if (ended := self._work.poll()) is not None:
             self._busy = False
             self._take(ended.result)

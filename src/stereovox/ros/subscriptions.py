@@ -72,7 +72,7 @@ class Subscriptions:
 
     arrived: called with topic and bytes of a message to map. on_path: called with those of a corrected path.
     messages: number of messages received, of all kinds. arrived_ns: when the last one arrived, monotonic.
-    Raises StereovoxError, one line, for an invalid topic name, and where nothing can give a pose: no /tf, for want of
+    Raises StereovoxError, one line, for an invalid topic name, and if nothing can give a pose: no /tf, for want of
     `tf2_msgs`, and no other source of poses in the options.
     """
 
@@ -134,7 +134,7 @@ class Subscriptions:
 
 
 def arrived(info: Mapping[str, int]) -> int:
-    """Return when a message was received, monotonic nanoseconds, by what rclpy says of it; now where it does not."""
+    """Return when a message was received, monotonic nanoseconds, by what rclpy says of it; now if it does not."""
     waited_ns = epoch_ns() - info.get("received_timestamp", 0)
     return monotonic_ns() - (waited_ns if 0 <= waited_ns <= LONGEST_NS else 0)
 

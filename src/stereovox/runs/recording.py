@@ -303,7 +303,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
             raise StereovoxError(f"{self.out}: a live camera does not know where in it it is; begin a new map")
 
     def _suggested(self, source: Stream) -> tuple[dict[str, Any], list[str]]:
-        """Return settings that a recording suggests where no profile chose them, and lines about them."""
+        """Return settings that a recording suggests if no profile chose them, and lines about them."""
         profile, level = self._options.profile, self._options.level
         named = isinstance(self._source, str | Path) and isinstance(source, Source)  # a live camera cannot be looked at
         if not named or (profile is not None and not level):
@@ -314,7 +314,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         settings = found.settings if profile is None else found.up_settings
         chosen, lines = settings(self._settings, LEVELLED if level else TILTED)
         if level and found.up is not None and found.up.sure:
-            chosen.setdefault("up", found.up.axis)  # where it is z, nothing had to be chosen
+            chosen.setdefault("up", found.up.axis)  # if it is z, nothing had to be chosen
         return chosen, lines
 
     def _level_direction(self, settings: Mapping[str, Any]) -> tuple[float, float, float] | None:

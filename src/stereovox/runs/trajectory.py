@@ -97,7 +97,7 @@ class CameraTrack:
         write_trajectory(path, self.stamps_ns[found].tolist(), self.T_world_sensor[found], whose)
 
     def picture(self, file: str | Path) -> None:
-        """Draw the way: from above, its height, where the camera was lost, and errors where there is a score.
+        """Draw the way: from above, its height, where the camera was lost, and errors if there is a score.
 
         Args:
             file: The picture to write: .png, .pdf or .svg.
@@ -284,7 +284,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
 
 
 def _own_poses(source: Source) -> NDArray[np.float64]:
-    """Return the poses (N, 4, 4) of a recording, NaN if there is none; without its images where it can do so."""
+    """Return the poses (N, 4, 4) of a recording, NaN if there is none; without its images if it can do so."""
 
     def pose(i: int) -> Transform:
         try:

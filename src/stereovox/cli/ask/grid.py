@@ -2,7 +2,7 @@
 """Map a ground robot's depth images or lidar scans to a 2-D floor map (map_server files).
 
 Poses come from SLAM (--poses slam), localisation in a map (--poses MAP.yaml) or the wheels (--poses odometry). The
-default is slam where there is a lidar.
+default is slam if there is a lidar.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="the calibration; for ROS two files, left eye first")
     parser.add_argument("--out", required=True, metavar="FILE", help="rig file to write, for example rig.toml")
-    parser.add_argument("--size", metavar="WxH", help="size of the images in pixels, where the file lacks it")
+    parser.add_argument("--size", metavar="WxH", help="size of the images in pixels, if the file lacks it")
     parser.add_argument(
         "--lens", default="", metavar="MODEL", help="fisheye, for an OpenCV calibration of fisheye lenses"
     )

@@ -83,7 +83,7 @@ def _calibrate(depth: DepthSource, folder: Path, settings: PairSettings, within_
 
 
 def _too_short(depth: DepthSource) -> str:
-    """Return the beginning of the error message where the recording is too short, else an empty string."""
+    """Return the beginning of the error message if the recording is too short, else an empty string."""
     from stereovox.sources.rigs.pair import image_times
 
     first_ns, last_ns = image_times(depth)

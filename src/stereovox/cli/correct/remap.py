@@ -30,7 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="corrected poses of the camera's optical frame: lines 'stamp tx ty tz qx qy qz qw' (TUM)",
     )  # fmt: skip
     parser.add_argument("--out", metavar="OUT", help="folder of the new map (default: NAME-corrected.svox here)")
-    parser.add_argument("--sensor", metavar="NAME", help="which sensor the poses are of, where the map has several")
+    parser.add_argument("--sensor", metavar="NAME", help="which sensor the poses are of, if the map has several")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--unit", metavar="U", help="unit of points: m, cm, mm, ft or us-ft (the file's own, else m)")
     parser.add_argument("--origin", metavar="X,Y,Z", help="point of the file, in metres, that becomes the map's origin")
     parser.add_argument("--heights", metavar="LO:HI", help="metres between which the walls of a floor's map stand")
-    parser.add_argument("--topic", metavar="T", help="topic in the bag, where there are several")
+    parser.add_argument("--topic", metavar="T", help="topic in the bag, if there are several")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:

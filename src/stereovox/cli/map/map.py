@@ -3,7 +3,7 @@
 
 SOURCE is a folder or file with depth images or stereo pairs and poses, recognised by its content (`stereovox info`
 says what it holds, docs/recordings.md what is known), the simulation sim:room, or a connected camera, realsense:. Which
-way is up, the range and the cell size follow from a look at the recording where no option or profile gives them. Under
+way is up, the range and the cell size follow from the recording if no option or profile gives them. Under
 a profile of two dimensions (ist2019) it is the recording of a ground robot, as for `stereovox grid`.
 """
 
@@ -57,7 +57,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         metavar="WHICH",
-        help="given: those of the recording (default, where there are any); track: found from the images "
+        help="given: those of the recording (default, if there are any); track: found from the images "
         "alone; both: given ones, corrected by the images",
     )
     parser.add_argument(

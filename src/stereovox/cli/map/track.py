@@ -28,7 +28,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", required=True, metavar="FILE", help="poses to write: .tum or .txt, lines 'stamp tx ty tz qx qy qz qw'"
     )
-    about = "the way from above, where the camera was lost, and errors where the recording has poses"
+    about = "the path from above, where the camera was lost, and errors if the recording has poses"
     parser.add_argument("--picture", metavar="FILE.png", help=about)
     add_usual(parser, "profile", "max-range", "frames", "camera")
     add_settings(parser, "noise.subpixel=0.1")

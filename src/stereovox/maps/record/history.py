@@ -125,7 +125,7 @@ class History:
         doubts: Cameras whose last frames disagree with the map more than usual.
         imported: The file of another program that the map began with; None if there was none.
         loops: The loops that were closed; None if none were sought, or poses were corrected otherwise since.
-        recordings: Number of recordings that were merged as their poses said; 1 where none were, or `join` made one way
+        recordings: Number of recordings that were merged as their poses said; 1 if none were, or `join` made one way
             of them, which it can where one was made after the other.
     """
 

@@ -97,7 +97,7 @@ class InFile:
 class Packed(NamedTuple):
     """A depth image without loss, packed.
 
-    dtype: of the depth. depth_bytes: how many of the bytes are its own; the rest are the reasons, where there are any.
+    dtype: of the depth. depth_bytes: how many of the bytes are its own; the rest are the reasons, if there are any.
     """
 
     dtype: str

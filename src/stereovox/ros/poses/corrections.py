@@ -85,7 +85,7 @@ class PathCorrections:
 
     def _mounts(self, frame_id: str) -> dict[str, Transform]:
         """Return T_body_sensor of the topics, nothing before the first frame; raises StereovoxError for a path in
-        another frame than the map, and where no sensor is mounted on the body whose poses it holds.
+        another frame than the map, and if no sensor is mounted on the body whose poses it holds.
         """
         if not (self._sensors and self._body):
             return {}
@@ -124,7 +124,7 @@ class JumpCorrections:
         self._jumps = OdometryJumps(min(mapping.config.cell), mapping.config.max_range)
 
     def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
-        """Ask for a correction where a frame shows that a jump has come to its end."""
+        """Ask for a correction if a frame shows that a jump has come to its end."""
         try:
             T_odom_sensor = self._place(frame_id, frame.stamp_ns)
         except FrameRefused as error:
@@ -177,7 +177,7 @@ def _span(stamps_ns: Iterable[int]) -> str:
 
 
 def check_corrections(options: Options, config: Config) -> None:
-    """Raise StereovoxError, one line, where a map cannot be corrected as the options ask."""
+    """Raise StereovoxError, one line, if a map cannot be corrected as the options ask."""
     asked = _asked(options)
     if not asked:
         return

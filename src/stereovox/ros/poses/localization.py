@@ -274,7 +274,7 @@ class LocalizingScanInput(ScanInput):
         return self._localizer.poses.odometry
 
     def frame(self, data: bytes, where: PoseLookup) -> Scan | None:
-        """Localise by a scan; return it with its pose in the map where it is to be mapped."""
+        """Localise by a scan; return it with its pose in the map if it is to be mapped."""
         scan = self.scan(data, where)
         try:
             found = self._localizer.locate(scan)

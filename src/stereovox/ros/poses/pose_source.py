@@ -119,7 +119,7 @@ class LidarPoses(PoseSource):
         return {**self._localizer.counts(), **bent}
 
     def update(self) -> None:
-        """Publish SLAM's map where it has grown."""
+        """Publish SLAM's map if it has grown."""
         if self._slam is None or not self._new or monotonic() < self._next:
             return
         self._new, self._next = False, monotonic() + SLAM_MAP_S

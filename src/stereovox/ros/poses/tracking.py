@@ -48,7 +48,7 @@ class Moved(NamedTuple):
 class TrackedPoses(PoseBuffer):
     """Poses by those of one tracked camera: transforms tell how sensors are mounted on the robot, and no more.
 
-    world: frame of the map; "": `odom`. base: frame of the robot; "": `base_footprint` or `base_link`, where the camera
+    world: frame of the map; "": `odom`. base: frame of the robot; "": `base_footprint` or `base_link`, if the camera
     is mounted on one of them, else the frame that carries the camera. extrapolate_s: as for `PoseBuffer`.
     base_needed: refuse frames of a camera that is not mounted on a robot's frame.
 

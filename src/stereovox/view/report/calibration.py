@@ -32,7 +32,7 @@ ALIKE = (
 )
 CONDITIONS = (
     "After Chien 2020, 2.2.4.1: the more pixels have a value the better. Errors are root mean squares over the "
-    "recordings in a condition; mean grey is that of the pixels with a value, where the image is known."
+    "recordings in a condition; mean grey is that of the pixels with a value, if the image is known."
 )
 
 

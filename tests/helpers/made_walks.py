@@ -35,12 +35,16 @@ def base_at(stamp_ns: int) -> Transform:
 
 
 def depth_at(k: int) -> Frame:
-    """Frame k: a wall at 2 m, a pole at 1.2 m."""
-    depth = np.full((CAMERA.height, CAMERA.width), 2000, np.uint16)
-    depth[:, 20 + k % 5 : 24 + k % 5] = 1200
-    depth[0] = 0
+    """Frame k: a wall across x = 3 m, a pole before it at x = 2 m."""
     stamp_ns = START_NS + k * FRAME_NS
-    return Frame(depth, CAMERA, base_at(stamp_ns) @ T_BASE_CAMERA, stamp_ns, 0.001)
+    T = base_at(stamp_ns) @ T_BASE_CAMERA
+    columns, rows = CAMERA.rays()
+    across = np.stack(np.broadcast_arrays(columns, rows[:, :1], rows[:, 1:]), axis=-1) @ T[:3, :3].T
+    wall_m, pole_m = ((x - T[0, 3]) / across[..., 0] for x in (3.0, 2.0))
+    pole = (pole_m > 0) & (abs(T[1, 3] + pole_m * across[..., 1]) < 0.08)
+    depth = np.where(pole, pole_m, np.maximum(wall_m, 0))
+    depth[0] = 0
+    return Frame((1000 * depth).round().astype(np.uint16), CAMERA, T, stamp_ns, 0.001)
 
 
 def write_room(path: Path, frames: list[Frame]) -> Path:

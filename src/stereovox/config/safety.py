@@ -21,7 +21,7 @@ class TrustConfig(Section):
     min_valid_share: share of the pixels that must have a depth or be too far; 0: one pixel is enough.
     min_surface_share: share of the depths that must lie on surfaces; 0: not checked.
     max_unexposed_share: share of the pixels of a stereo image that may be black or saturated; 1: all.
-    frozen: refuse an image that repeats the previous one exactly although the camera has moved.
+    frozen: refuse an image that repeats what was seen from elsewhere, exactly or with new noise.
     max_disagreement: share of a frame's evidence on certain cells that may contradict the map, beyond what is usual for
         its sensor; 1: not checked.
     pose_error_m: occasional pose error in metres; a frame may disagree by this, relative to the size of a cell.

@@ -125,6 +125,8 @@ CHECKS = (
           "trust.max_speed_mps, trust.max_turn_dps"),
     Check("frozen_image", "it is identical to the one before, but the sensor has moved by over 1 cm or 0.5 degrees",
           _cells(Gate._look), "trust.frozen"),
+    Check("frozen_image", "it shows what the sensor saw from elsewhere, with new noise",
+          _cells(Gate._glances, Gate._glances, "a scan may look the same from many places"), "trust.frozen"),
     Check("bad_units", "half of its depths or ranges are far beyond, or far below, what the map's limits allow",
           _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays)),
     Check("no_valid_depth", "not one pixel has a value, and none is too far",

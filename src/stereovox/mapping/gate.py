@@ -17,6 +17,8 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
+from stereovox.mapping.frozen import FrozenViews, is_frozen, with_glance
+from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.history import (
     MAX_NAME_LENGTH,
     MAX_SENSORS,
@@ -45,7 +47,7 @@ class GateResult(NamedTuple):
     """A frame that passed the gate: its sensor, stamp and pose.
 
     after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None for scans. agreement:
-    how it agrees with the map, None if that was not compared.
+    how it agrees with the map, None if that was not compared. glances: what is kept of its sensor's views.
     """
 
     sensor: str
@@ -53,6 +55,7 @@ class GateResult(NamedTuple):
     after: str = ""
     look: ImageFingerprint | None = None
     agreement: Agreement | None = None
+    glances: tuple[Glance, ...] = ()
 
     @property
     def note(self) -> str:
@@ -72,6 +75,7 @@ class Gate:
     def __init__(self, config: Config, history: History):
         trust = config.trust
         self._history, self._trust, self._monitor = history, trust, DisagreementMonitor(config, history)
+        self._views = FrozenViews(config)
         self._turn = radians(trust.max_turn_dps)
         off, reset, ahead, settle = trust.max_pose_off_s, trust.clock_reset_s, trust.max_gap_s, trust.settle_s
         self._off_ns, self._reset_ns, self._ahead_ns, self._settle_ns = (
@@ -91,6 +95,9 @@ class Gate:
         passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
         if passed.after:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
+            self._history.glances.pop(sensor, None)
+        if self._trust.frozen and not isinstance(image, Scan):
+            return passed._replace(glances=self._glances(frame, sensor, image))
         return passed
 
     def in_doubt(self, passed: GateResult, against: float | None) -> bool:
@@ -122,6 +129,8 @@ class Gate:
         self._history.waiting.pop(passed.sensor, None)
         if passed.look is not None:
             self._history.looks[passed.sensor] = passed.look
+        if passed.glances:
+            self._history.glances[passed.sensor] = passed.glances
         if passed.agreement is not None:
             self._monitor.accept(passed.sensor, passed.agreement)
         if passed.after:
@@ -153,6 +162,18 @@ class Gate:
             detail = f"the {what} is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
+
+    def _glances(self, frame: AnyFrame | Scan, sensor: str, image: AnyImage) -> tuple[Glance, ...]:
+        """Return the glances to keep. Raises FrameRefused for a frame that shows what was seen from elsewhere."""
+        glances, ranges, T = self._history.glances.get(sensor, ()), self._views.ranges(image), image.T_world_sensor
+        in_sensor, in_world = self._views.unmoved(glances, image.camera, T, ranges)
+        if is_frozen(in_sensor, in_world):
+            detail = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
+            raise FrameRefused(
+                "frozen_image",
+                f"{name_of(frame)}: it shows what was seen from elsewhere ({detail}); restart the sensor",
+            )
+        return with_glance(glances, T, ranges)
 
     def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one, or that is accepted again."""

@@ -23,6 +23,7 @@ def history_of(left, right):
         waiting={"left": Streak("pose_jump", 5, seen(6, 9.0)), "right": Streak("pose_jump", 5, seen(6, 9.0))},
         looks={"left": ImageFingerprint(7, seen(0, 0.5).pose), "right": ImageFingerprint(8, seen(0, 0.5).pose)},
         doubts={"left": DisagreementSpell(1, 2), "right": DisagreementSpell(1, 2)},
+        glances={"left": (), "right": ()},
     )
 
 
@@ -34,7 +35,7 @@ def test_a_sensor_that_moved_is_remembered_where_it_is_now():
     correct_history(history, before, after)
     assert history.loops is None
     assert history.trusted == {"left": after[2][1], "right": before[3][1]}
-    assert list(history.waiting) == list(history.doubts) == ["right"]
+    assert list(history.waiting) == list(history.doubts) == list(history.glances) == ["right"]
     moved = matrix_of(after[2][1]) @ np.linalg.inv(matrix_of(before[2][1])) @ matrix_of(seen(0, 0.5))
     assert np.allclose(matrix_of(StampedPose(0, history.looks["left"].pose)), moved)
     assert history.looks["right"] == ImageFingerprint(8, seen(0, 0.5).pose)

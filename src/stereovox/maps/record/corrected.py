@@ -41,6 +41,7 @@ def _correct_sensor(history: History, sensor: str, old: StampedPose, new: Stampe
     T_new_old = matrix_of(new) @ inverse(matrix_of(old))
     history.waiting.pop(sensor, None)
     history.doubts.pop(sensor, None)
+    history.glances.pop(sensor, None)
     if (look := history.looks.get(sensor)) is not None:
         history.looks[sensor] = look._replace(pose=_moved(look.pose, T_new_old))
     if (trusted := history.trusted.get(sensor)) is not None:  # a merged map trusts none so far

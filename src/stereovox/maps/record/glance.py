@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import zlib
 from base64 import b64decode, b64encode
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.geometry.se3 import Transform
+from stereovox.maps.record._glance import SAME, SIDE, UNSEEN, bin_points, place
 
-SIDE = 128
-"""Directions are binned in an octahedron laid flat (Meyer et al. 2010), SIDE by SIDE bins of about 1.6 degrees."""
-AROUND = range(-1, 2)
-"""Neighbours of a bin in which a point may have been seen, along each axis."""
+MARKS = 300
+"""Points of a glance that later frames are compared with."""
+AT_REST = np.eye(4, dtype=np.float32)[:3]
+"""Of points that are in the sensor and not in the world."""
 
 
 class Glance(NamedTuple):
@@ -34,10 +36,18 @@ class Glance(NamedTuple):
     @classmethod
     def at(cls, points: NDArray[np.float64], T_world_sensor: Transform) -> Glance:
         """Return the glance at points (N, 3) in the sensor's frame."""
-        ranges = np.zeros((SIDE, SIDE), np.float16)
-        v, u = _bins(points)
-        ranges[v, u] = np.minimum(np.linalg.norm(points, axis=1), 6e4)
-        return cls(tuple(T_world_sensor[:3].ravel().tolist()), ranges.tobytes())
+        return cls.of(binned(points), T_world_sensor)
+
+    @classmethod
+    def of(cls, ranges: NDArray[np.float32], T_world_sensor: Transform) -> Glance:
+        """Return the glance with ranges (SIDE, SIDE) in metres, 0: nothing."""
+        packed = np.minimum(ranges, np.float32(6e4)).astype(np.float16)
+        return cls(tuple(T_world_sensor[:3].ravel().tolist()), packed.tobytes())
+
+    @property
+    def typical_m(self) -> float:
+        """Median of its ranges in metres, 0 if it saw nothing."""
+        return _median(self.ranges)
 
     def packed(self) -> str:
         """Return its ranges as text, which `unpacked` reads."""
@@ -60,16 +70,18 @@ class Glance(NamedTuple):
 
         tolerance: (N,) metres by which ranges may differ.
         """
-        ranges = np.frombuffer(self.ranges, np.float16).reshape(SIDE, SIDE).astype(float)
         T = np.reshape(self.pose, (3, 4))
-        there = (points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3] - T[:, 3]) @ T[:, :3]
-        in_view, in_world = _matches(ranges, there, tolerance)
-        _, in_sensor = _matches(ranges, points, tolerance)
+        here = np.column_stack([T[:, :3].T @ T_world_sensor[:3, :3], T[:, :3].T @ (T_world_sensor[:3, 3] - T[:, 3])])
+        there, off = np.ascontiguousarray(points, np.float32), np.asarray(tolerance, np.float32)
+        found = np.empty((2, len(points)), np.uint8)
+        for motion, out in zip((here.astype(np.float32), AT_REST), found, strict=True):
+            place(_metres(self.ranges), there, motion, off, out)
+        in_view, (in_world, in_sensor) = found[0] != UNSEEN, found == SAME
         return Votes(
-            int((in_view & in_world & ~in_sensor).sum()),
-            int((in_view & in_sensor & ~in_world).sum()),
-            int((in_view & ~in_sensor & ~in_world).sum()),
-            int((in_view & in_sensor & in_world).sum()),
+            int(np.count_nonzero(in_world & ~in_sensor)),
+            int(np.count_nonzero(in_view & in_sensor & ~in_world)),
+            int(np.count_nonzero(in_view & ~(in_sensor | in_world))),
+            int(np.count_nonzero(in_world & in_sensor)),
         )
 
 
@@ -85,26 +97,44 @@ class Votes(NamedTuple):
     both: int = 0
 
 
-def _matches(
-    ranges: NDArray[np.float64], points: NDArray[np.float64], tolerance: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which points (N, 3) lie where something was seen, and which of them as far away."""
-    v, u = _bins(points)
-    far = np.linalg.norm(points, axis=1)
-    seen, same = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    for dv in AROUND:
-        for du in AROUND:
-            found = ranges[np.clip(v + dv, 0, SIDE - 1), np.clip(u + du, 0, SIDE - 1)]
-            seen |= found > 0
-            same |= (found > 0) & (np.abs(found - far) <= tolerance)
-    return seen, same
+def binned(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the ranges (SIDE, SIDE) in metres of points (N, 3) in the sensor's frame; 0: nothing."""
+    ranges = np.zeros((SIDE, SIDE), np.float32)
+    bin_points(np.ascontiguousarray(points, np.float32), ranges)
+    return ranges
 
 
-def _bins(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return row and column (N,) of the bins of directions (N, 3); z is in the middle of the square."""
-    x, y, z = (points / np.maximum(np.abs(points).sum(axis=1, keepdims=True), 1e-9)).T
-    behind = z < 0
-    a = np.where(behind, (1 - np.abs(y)) * np.where(x < 0, -1, 1), x)
-    b = np.where(behind, (1 - np.abs(x)) * np.where(y < 0, -1, 1), y)
-    row, column = (np.clip(((side + 1) / 2 * SIDE).astype(np.int64), 0, SIDE - 1) for side in (b, a))
-    return row, column
+@lru_cache(maxsize=64)
+def _metres(ranges: bytes) -> NDArray[np.float32]:
+    """Return the ranges (SIDE, SIDE) of a glance in metres."""
+    return np.frombuffer(ranges, np.float16).reshape(SIDE, SIDE).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def _median(ranges: bytes) -> float:
+    metres = _metres(ranges)
+    return float(np.median(metres[metres > 0])) if metres.any() else 0.0
+
+
+class Marks(NamedTuple):
+    """Points of a glance that later frames are compared with, (N, 3) each, in the sensor's frame and in the world's."""
+
+    sensor: NDArray[np.float32]
+    world: NDArray[np.float64]
+
+
+@lru_cache(maxsize=64)
+def marks_of(glance: Glance) -> Marks:
+    """Return at most MARKS points of a glance, in the middle of their bins."""
+    metres = _metres(glance.ranges)
+    row, column = np.nonzero(metres)
+    some = slice(None, None, max(1, -(-len(row) // MARKS)))
+    row, column = row[some], column[some]
+    b, a = ((2 * side + 1) / SIDE - 1 for side in (row, column))
+    z = 1 - np.abs(a) - np.abs(b)
+    x = np.where(z < 0, (1 - np.abs(b)) * np.sign(a), a)
+    y = np.where(z < 0, (1 - np.abs(a)) * np.sign(b), b)
+    points = np.stack([x, y, z], axis=1)
+    points *= (metres[row, column] / np.linalg.norm(points, axis=1))[:, None]
+    T = np.reshape(glance.pose, (3, 4))
+    return Marks(points.astype(np.float32), points @ T[:, :3].T + T[:, 3])

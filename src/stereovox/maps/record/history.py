@@ -26,6 +26,8 @@ OTHERS = "others"
 MAX_NAME_LENGTH = 256
 MAX_NOTES = 16
 """Notes about an imported file."""
+MAX_GLANCES = 4
+"""Glances that are kept of each sensor: what it saw lately, from poses apart."""
 EARLIEST, LATEST = -(2**63), 2**63 - 1
 """Range of stamps in int64 nanoseconds."""
 CHANGED, MOVED = "changed", "moved"
@@ -123,6 +125,7 @@ class History:
         looks: Last image of each camera.
         usual: Usual disagreement with the map of each camera's frames, 0 to 1.
         doubts: Cameras whose last frames disagree with the map more than usual.
+        glances: What each sensor saw lately, from poses apart, the newest last; later frames are compared with it.
         imported: The file of another program that the map began with; None if there was none.
         loops: The loops that were closed; None if none were sought, or poses were corrected otherwise since.
         recordings: Number of recordings that were merged as their poses said; 1 if none were, or `join` made one way
@@ -141,6 +144,7 @@ class History:
     looks: dict[str, ImageFingerprint] = field(default_factory=dict)
     usual: dict[str, RunningMean] = field(default_factory=dict)
     doubts: dict[str, DisagreementSpell] = field(default_factory=dict)
+    glances: dict[str, tuple[Glance, ...]] = field(default_factory=dict)
     imported: Imported | None = None
     loops: LoopLines | None = None
     recordings: int = 1
@@ -189,6 +193,7 @@ class History:
                 "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
                 "usual": {name: list(usual) for name, usual in self.usual.items()},
                 "doubts": {name: _doubt_to(doubt) for name, doubt in self.doubts.items()},
+                "glances": {name: [_glance_to(one) for one in seen] for name, seen in self.glances.items()},
             },
             "camera_path": self.path.saved(),
             "loops": None if self.loops is None else self.loops.saved(),
@@ -221,6 +226,9 @@ class History:
         history.looks = {name: _look_from(look) for name, look in _sensors(entries["looks"]).items()}
         history.usual = {name: _usual_from(shares) for name, shares in _sensors(entries["usual"]).items()}
         history.doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries["doubts"]).items()}
+        history.glances = {  # older maps have none
+            name: _glances_from(seen) for name, seen in _sensors(entries.get("glances", {})).items()
+        }
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
@@ -282,8 +290,21 @@ def _look_from(saved: Any) -> ImageFingerprint:
 
 
 def _doubt_to(doubt: DisagreementSpell) -> dict[str, Any]:
-    glance = None if doubt.glance is None else {"pose": list(doubt.glance.pose), "ranges": doubt.glance.packed()}
-    return {**doubt._asdict(), "glance": glance}
+    return {**doubt._asdict(), "glance": None if doubt.glance is None else _glance_to(doubt.glance)}
+
+
+def _glance_to(glance: Glance) -> dict[str, Any]:
+    return {"pose": list(glance.pose), "ranges": glance.packed()}
+
+
+def _glance_from(saved: Any) -> Glance:
+    return Glance.unpacked(_pose_from(saved["pose"]), saved["ranges"])
+
+
+def _glances_from(saved: Any) -> tuple[Glance, ...]:
+    if not isinstance(saved, list) or len(saved) > MAX_GLANCES:
+        raise ValueError(f"history: glances are no list of at most {MAX_GLANCES}")
+    return tuple(map(_glance_from, saved))
 
 
 def _doubt_from(saved: Any) -> DisagreementSpell:
@@ -291,8 +312,7 @@ def _doubt_from(saved: Any) -> DisagreementSpell:
     frames, fits, looks = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits", "looks"))
     if saved["verdict"] not in ("", CHANGED, MOVED):
         raise ValueError("history: a doubt has no such verdict")
-    glance = saved["glance"]
-    seen = None if glance is None else Glance.unpacked(_pose_from(glance["pose"]), glance["ranges"])
+    seen = None if saved["glance"] is None else _glance_from(saved["glance"])
     return DisagreementSpell(since_ns, last_ns, frames, fits, saved["verdict"], looks, seen)
 
 

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find a frame that shows what its sensor saw from elsewhere: frozen, whatever noise each image has.
+
+What is in the world stays there as the sensor moves; what is in a frozen image moves with the sensor. So a frame is
+compared with glances that the sensor had from other poses: points that are unmoved in the sensor, and in the world.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.config import Config
+from stereovox.frame import AnyImage, CheckedCloud
+from stereovox.geometry.se3 import Transform, apart
+from stereovox.integrate.views import PerCamera, camera_rays
+from stereovox.maps.record._glance import SAME, SIDE, UNSEEN, bin_image, place
+from stereovox.maps.record.glance import AT_REST, Glance, binned, marks_of
+from stereovox.maps.record.history import MAX_GLANCES
+from stereovox.sensors.noise import RangeNoise
+
+SAMPLED = 4000
+"""Most points of a frame that are compared."""
+FARTHEST = 10
+"""Maximum ranges beyond which points do not count: a lidar may report any distance."""
+BLUR = 1.5
+"""Tolerance between two frames, as a multiple of the noise of one: both are noisy."""
+STEP, TURN = 0.1, np.radians(8)
+"""A glance is kept once the sensor has moved by this share of the median distance in view, or turned by this angle."""
+NEAR, NEAR_TURN = 0.3, 0.4
+"""Up to this motion a glance is compared: from farther away, many points are unmoved by chance."""
+FEW, TIMES = 20, 1.5
+"""A frame is frozen if this many points are unmoved in the sensor alone, and this many times more than in the world."""
+
+
+class FrozenViews:
+    """Compares frames with glances that the same sensor had lately."""
+
+    def __init__(self, config: Config):
+        self._reach, self._least = FARTHEST * config.max_range, config.voxel_size
+        self._noise = PerCamera(partial(RangeNoise.of, config.noise))
+
+    def ranges(self, image: AnyImage) -> NDArray[np.float32]:
+        """Return the distance seen in each direction: (SIDE, SIDE) metres, 0: nothing."""
+        if isinstance(image, CheckedCloud):
+            points = image.ends[:: max(1, -(-len(image.ends) // SAMPLED))]
+            points = points[image.hits[:: max(1, -(-len(image.ends) // SAMPLED))]]
+            with np.errstate(over="ignore"):
+                return binned(points[np.einsum("ni,ni->n", points, points) <= self._reach**2])
+        ranges = np.zeros((SIDE, SIDE), np.float32)
+        step = max(1, round((image.depth_m.size / SAMPLED) ** 0.5))
+        bin_image(image.depth_m, *camera_rays(image.camera), step // 2, step, np.float32(self._reach), ranges)
+        return ranges
+
+    def unmoved(
+        self, glances: tuple[Glance, ...], camera: VirtualCamera | Lidar, T: Transform, ranges: NDArray[np.float32]
+    ) -> tuple[int, int]:
+        """Return how many points of `glances` are where they were in the sensor alone, and in the world alone.
+
+        T: T_world_sensor (4, 4) of the frame. ranges: (SIDE, SIDE) metres that it saw.
+        """
+        in_sensor = in_world = 0
+        for glance in glances:
+            metres, angle = apart(glance.pose, tuple(T[:3].ravel().tolist()))
+            if metres >= NEAR * glance.typical_m or angle >= NEAR_TURN:
+                continue
+            marks = marks_of(glance)
+            moved = self._placed(ranges, camera, (marks.world - T[:3, 3]) @ T[:3, :3])
+            fixed = self._placed(ranges, camera, marks.sensor)
+            in_sensor += int(np.count_nonzero((moved != UNSEEN) & (moved != SAME) & (fixed == SAME)))
+            in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
+        return in_sensor, in_world
+
+    def _placed(
+        self, ranges: NDArray[np.float32], camera: VirtualCamera | Lidar, points: NDArray[np.floating]
+    ) -> NDArray[np.uint8]:
+        """Return how points (N, 3) in the sensor's frame compare with what it sees, as `place`."""
+        distances = np.sqrt(np.einsum("ni,ni->n", points, points))
+        tolerance = BLUR * np.maximum(self._least, self._noise[camera].sigma(distances))
+        found = np.empty(len(points), np.uint8)
+        place(ranges, points.astype(np.float32), AT_REST, tolerance.astype(np.float32), found)
+        return found
+
+
+def is_frozen(in_sensor: int, in_world: int) -> bool:
+    """Return whether points that are unmoved show a frozen image."""
+    return in_sensor >= FEW and in_sensor > TIMES * in_world
+
+
+def with_glance(glances: tuple[Glance, ...], T: Transform, ranges: NDArray[np.float32]) -> tuple[Glance, ...]:
+    """Return the glances to keep after a frame: it is added if it was taken elsewhere than the last one."""
+    if glances:
+        metres, angle = apart(glances[-1].pose, tuple(T[:3].ravel().tolist()))
+        if metres < STEP * glances[-1].typical_m and angle < TURN:
+            return glances
+    return (*glances, Glance.of(ranges, T))[-MAX_GLANCES:]

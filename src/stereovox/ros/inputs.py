@@ -20,6 +20,7 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Cloud, Frame, Scan
 from stereovox.geometry.se3 import inverse
 from stereovox.ros.poses.poses import Pose, PoseBuffer
+from stereovox.sources.bags.compressed_depth import SUFFIXES, plain_topic
 from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
 from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud
@@ -33,7 +34,6 @@ LONGEST_SWEEP_S = 0.5
 """Seconds of a turn of a lidar; clouds whose points have later times do not wait for their poses."""
 NO_POSE = np.full((4, 4), np.nan)
 NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
-COMPRESSED = "/compressedDepth"
 PoseLookup = Callable[[str, int], Pose]
 """Returns the pose of a frame (by its name) at a time in nanoseconds; raises FrameRefused."""
 
@@ -77,12 +77,12 @@ def header(data: bytes) -> tuple[int, str]:
 
 
 class DepthInput(Input):
-    """Depth images (16UC1, 32FC1, or compressedDepth, by the topic's name) and their camera_info."""
+    """Depth images (16UC1, 32FC1, or compressed ones if the topic's name says so) and their camera_info."""
 
     def __init__(self, topic: str, info: str = ""):
-        self.topic, self._packed = topic, topic.endswith(COMPRESSED)
+        self.topic, self._packed = topic, topic.endswith(SUFFIXES)
         self.kind = "sensor_msgs/CompressedImage" if self._packed else "sensor_msgs/Image"
-        self.info = info or sibling(topic.removesuffix(COMPRESSED), "camera_info")
+        self.info = info or sibling(plain_topic(topic), "camera_info")
         self._camera: PinholeCamera | None = None
         self._trouble = f"{topic}: no camera_info came on {self.info}; name its topic: --depth {topic}=INFO"
 

@@ -80,16 +80,6 @@ def test_the_plain_topic_comes_before_the_compressed_one(tmp_path):
     np.testing.assert_array_equal(BagSource(bag.path).frame(0).depth, depth(1))
 
 
-def test_floats_packed_as_compressed_depth_are_refused(tmp_path):
-    with Bag(tmp_path / "a.bag") as bag:
-        packed = compressed(depth(3), "32FC1; compressedDepth png")
-        bag.add(f"{TOPIC}/compressedDepth", "sensor_msgs/CompressedImage", stamp(0), packed)
-        bag.add(INFO, "sensor_msgs/CameraInfo", stamp(0), camera_info())
-    frame = BagSource(bag.path).frame(0)
-    assert frame.fault == "bad_dtype"
-    assert "32FC1; compressedDepth png" in frame.fault_detail
-
-
 NUMBERS = (1.0, -2.0, 3.0, 0.1, -0.2, 0.3, 0.9)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import MAX_PIXELS, PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, StereovoxError, did_you_mean
+from stereovox.sources.bags.compressed_depth import PACKED, SUFFIXES, decompressed, holds_depth, plain_topic
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import (
     CameraInfo,
@@ -22,7 +23,6 @@ from stereovox.sources.bags.messages import (
     read_pairs,
     read_value,
 )
-from stereovox.sources.images import decode_depth_png
 
 PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 VALUES = ("std_msgs/Float32", "std_msgs/String")
@@ -31,14 +31,11 @@ RECTIFIED = re.compile(r"(?<![a-z])rect")
 """Matches topic names such as `image_rect` and `rectified`, but not `direct`."""
 REALSENSE = re.compile(r"((/device_\d+/sensor_\d+)/Depth_\d+)/image/data(/compressedDepth)?")
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
-PACKED = "compressedDepth"
 UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
 """Encodings and their usual metres per unit (REP 118); librealsense calls its own images mono16."""
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 DEPTH = ("16UC1", "32FC1")
 """Encodings of depth; mono16 counts only in RealSense files, or if the user selects its topic."""
-PNG_AT = 12
-"""A compressedDepth image starts with 12 bytes on the packing of floats; the PNG follows."""
 
 
 class DepthTopic:
@@ -107,7 +104,8 @@ def depth_topics(file: BagFile) -> list[str]:
     """Return the topics with depth images: RealSense's own if present, else by the encoding of the images."""
     realsense = sorted(filter(REALSENSE.fullmatch, file.types))
     found = realsense or sorted(topic for topic in file.types if _is_depth(file, topic))
-    return [topic for topic in found if topic.removesuffix(f"/{PACKED}") not in set(found) - {topic}]
+    of_one = {plain_topic(topic): [f"{plain_topic(topic)}{suffix}" for suffix in ("", *SUFFIXES)] for topic in found}
+    return [next(filter(set(found).__contains__, names)) for names in of_one.values()]
 
 
 def first_picture(file: BagFile, topic: str, attempts: int = 3) -> Picture | None:
@@ -136,10 +134,7 @@ def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) ->
     FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
     """
     if packed:
-        encoding = picture.encoding.partition(";")[0].strip()
-        if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
-            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not supported; record it as 16UC1")
-        return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
+        return decompressed(picture, size, name)
     if picture.encoding not in DTYPES:
         raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not depth; it must be 16UC1 or 32FC1")
     if (picture.width, picture.height) != size:
@@ -234,7 +229,7 @@ def sibling(topic: str, name: str) -> str:
 def _places(topic: str, stream: str | None) -> list[str]:
     if stream:
         return [f"{stream}/info/camera_info", f"{stream}/camera_info", f"{stream}/image/camera_info"]
-    return [sibling(topic.removesuffix("/compressedDepth"), "camera_info")]
+    return [sibling(plain_topic(topic), "camera_info")]
 
 
 def _read(file: BagFile, topic: str) -> CameraInfo:
@@ -258,7 +253,9 @@ def _is_depth(file: BagFile, topic: str) -> bool:
     if file.types[topic] not in (IMAGE, COMPRESSED):
         return False
     picture = first_picture(file, topic)
-    return picture is not None and (picture.encoding in DEPTH or PACKED in picture.encoding)
+    if picture is None:
+        return False
+    return picture.encoding in DEPTH if file.types[topic] == IMAGE else holds_depth(picture, topic)
 
 
 def _pixels(picture: Picture, name: str) -> NDArray[np.generic]:

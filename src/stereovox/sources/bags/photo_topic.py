@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Photo
 from stereovox.geometry.se3 import Transform
+from stereovox.sources.bags.compressed_depth import holds_depth
 from stereovox.sources.bags.depth_topic import (
     CAMERA_INFO,
     COMPRESSED,
     IMAGE,
-    PACKED,
     RECTIFIED,
     DepthTopic,
     camera_of,
@@ -125,5 +125,5 @@ def _is_photo(file: BagFile, topic: str) -> bool:
     picture = first_picture(file, topic)
     if picture is None:
         return False
-    packed = file.types[topic] == COMPRESSED and PACKED not in picture.encoding
+    packed = file.types[topic] == COMPRESSED and not holds_depth(picture, topic)
     return picture.encoding in CHANNELS or packed

@@ -69,6 +69,26 @@ def test_all_greys_mean_what_they_do_to_map_server(tmp_path, mode, negate, thres
     assert grid.origin == (-1.5, 2.0, 0.5)
 
 
+@pytest.mark.parametrize("mode", [None, "trinary", "scale", "raw"])
+@pytest.mark.parametrize("negate", ["0", "1"])
+@pytest.mark.parametrize(
+    ("free_thresh", "grey", "unknown"), [(0.25, 205, 3), (0.196, 205, 3), (0.25, 205, 0), (0.25, 204, 3)]
+)
+def test_unknown_cells_that_the_thresholds_make_free_are_noted(tmp_path, mode, negate, free_thresh, grey, unknown):
+    """205 has p = 0.196: free for nav2's free_thresh of 0.25, as ROS reads it too; negated, it is occupied."""
+    pixels = np.full((10, 10), 254)
+    pixels[0, :unknown] = grey
+    grid = read_map_server(made_map(tmp_path, pixels, mode=mode, negate=negate, free_thresh=free_thresh))
+    lost = mode in (None, "trinary") and negate == "0" and free_thresh == 0.25 and grey == 205 and unknown == 3
+    assert bool(grid.note) == lost
+    if lost:
+        assert (grid.cells[-1, :3] == 0).all()
+        assert grid.note == (
+            "3% of its pixels are grey 205, which map_saver writes for unknown cells; "
+            "free_thresh 0.25 makes them free: correct it to 0.196 in the .yaml"
+        )
+
+
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize(
     ("kind", "ending"), [("L", "png"), ("L", "bmp"), ("RGB", "png"), ("RGB", "bmp"), ("RGBA", "png")]

@@ -64,10 +64,13 @@ def describe_saved(voxel_map: VoxelMap, out: str, doubts: Doubts = ()) -> dict[s
 
 
 def open_grid(path: str) -> OccupancyGrid:
-    """Read a map from map_server files; raises MapFileError, one line that names the file."""
+    """Read a map from map_server files, and print its note; raises MapFileError, one line that names the file."""
     from stereovox.formats.map_server import read_map_server
 
-    return read_map_server(path)
+    grid = read_map_server(path)
+    if grid.note:
+        say(f"note: {path}: {grid.note}")
+    return grid
 
 
 def check_not_map_image(file: str, path: str) -> None:

@@ -104,6 +104,7 @@ def describe_floor(path: str) -> Description | None:
         "origin": list(map(float, grid.origin)),
         "free_below": grid.free_below,
         "occupied_above": grid.occupied_above,
+        "note": grid.note,
     }
     commands = [command_line("picture", path, picture_name(path)), command_line("localize", "ROBOT", "--map", path)]
     return Description("floor map", _floor_lines(result), result, commands)
@@ -194,6 +195,8 @@ def _floor_lines(result: dict[str, Any]) -> list[str]:
     lines.append(
         ", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative", "unknown"))
     )
+    if result["note"]:
+        lines.append(f"note: {result['note']}")
     if result["tentative"]:
         lines.append(f"free: p < {result['free_below']:g}; occupied: p > {result['occupied_above']:g}")
     return lines

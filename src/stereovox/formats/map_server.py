@@ -35,6 +35,8 @@ _NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 """Values that map_saver writes. With nav2's free_thresh of 0.25, its own grey 205, unknown, would be read as free."""
 FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL, NO_PIXEL = 254, 205, 0, 128
+MANY_UNKNOWN = 0.01
+"""Share of pixels with the grey of unknown cells that is no chance."""
 SCALE_STEPS = 254
 """Grey levels of mode scale between 0 and 99 per cent: each per cent is read back unchanged."""
 
@@ -48,12 +50,15 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
     for transparent pixels.
     raw: the brightness, rounded down, if that is 0 to 100, else -1. The map's thresholds are then the file's.
     (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
+    If that makes the grey of unknown cells free, as in map_server, the map's `note` says so.
     Raises MapFileError: one line with the file and the problem.
     """
     metadata = metadata_of(path)
-    cells = np.ascontiguousarray(_cells(read_picture(metadata.image), metadata)[::-1])
+    picture = read_picture(metadata.image)
+    found = _cells(picture, metadata)
+    cells = np.ascontiguousarray(found[::-1])
     if metadata.mode != "raw":
-        return OccupancyGrid(cells, metadata.resolution, metadata.origin)
+        return OccupancyGrid(cells, metadata.resolution, metadata.origin, note=_note(picture, found, metadata))
     return OccupancyGrid(cells, metadata.resolution, metadata.origin, metadata.free_thresh, metadata.occupied_thresh)
 
 
@@ -351,6 +356,17 @@ def _cells(picture: Picture, metadata: Metadata) -> NDArray[np.int8]:
     if picture.brightness.dtype == np.uint8:
         return _through(_percent(np.arange(256.0), None, metadata), picture.brightness).view(np.int8)
     return _percent(picture.brightness, picture.see_through, metadata)
+
+
+def _note(picture: Picture, cells: NDArray[np.int8], metadata: Metadata) -> str:
+    """Return a note if the grey that map_saver writes for unknown cells is read as free, "" otherwise."""
+    lost = np.count_nonzero((cells == 0) & (picture.brightness == UNKNOWN_PIXEL)) / max(cells.size, 1)
+    if metadata.mode != "trinary" or lost < MANY_UNKNOWN:  # in mode scale unknown cells are transparent
+        return ""
+    return (
+        f"{lost:.0%} of its pixels are grey {UNKNOWN_PIXEL}, which map_saver writes for unknown cells; "
+        f"free_thresh {metadata.free_thresh:g} makes them free: correct it to {FREE_THRESH} in the .yaml"
+    )
 
 
 def _through(table: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.uint8]:

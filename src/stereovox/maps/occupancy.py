@@ -27,6 +27,7 @@ class OccupancyGrid:
         origin: (3,) x, y in metres and yaw in radians of the lower left corner of cell (0, 0) in the map's frame.
         free_below: Probability below which a known cell counts as free.
         occupied_above: Probability above which a known cell counts as occupied.
+        note: What a reader noticed about its file, for the user; "": nothing.
 
     Raises:
         StereovoxError: `cells` or `origin` has another shape.
@@ -37,6 +38,7 @@ class OccupancyGrid:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     free_below: float = 0.3
     occupied_above: float = 0.7
+    note: str = ""
 
     def __post_init__(self) -> None:
         if np.ndim(self.cells) != 2:

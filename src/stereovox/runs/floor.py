@@ -211,6 +211,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         if Path(how).suffix.lower() not in FLOOR_READABLE:
             raise StereovoxError(f"poses {how}: give slam, odometry, or the .yaml of a map to localise in")
         floor = read_map_server(how)
+        self._notify_unless_empty(f"note: {how}: {floor.note}" if floor.note else "")
         check_start(self._start, floor)
         return how, floor
 

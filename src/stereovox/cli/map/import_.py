@@ -14,7 +14,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.maps import check_new_floor, refuse_options
+from stereovox.cli.maps import check_new_floor, open_grid, refuse_options
 from stereovox.cli.options import heights_of, numbers_of
 from stereovox.cli.terminal import say, thousands
 from stereovox.errors import StereovoxError
@@ -92,9 +92,9 @@ def _read_bag(arguments: Namespace) -> tuple[OccupancyGrid, str]:
 
 def _read_floor(arguments: Namespace) -> tuple[OccupancyGrid, str]:
     """Return a floor's map and the mode it is to be written in: its own, so that no value is lost."""
-    from stereovox.formats.map_server import metadata_of, read_map_server
+    from stereovox.formats.map_server import metadata_of
 
     refuse_options(arguments, ["topic"], "a floor's map has no topics")
     metadata = metadata_of(arguments.file)
     check_new_floor(arguments.map, arguments.file, metadata.image)
-    return read_map_server(arguments.file), metadata.mode
+    return open_grid(arguments.file), metadata.mode

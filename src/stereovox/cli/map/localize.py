@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereovox.cli.maps import open_grid
 from stereovox.cli.robot_options import add_robot, open_noting, print_trajectory_error, settings_of
 from stereovox.cli.terminal import but_few, progress_of_steps, say, say_about_compiling
 from stereovox.files.safe_io import check_file
@@ -45,11 +46,10 @@ def add_start(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the trajectory and print where it ends."""
     from stereovox.evaluate.summary import mostly_lost
-    from stereovox.formats.map_server import read_map_server
     from stereovox.localize.robot_track import check_start, fit_of, localise_robot, parse_start, refused_line
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
-    start, grid = parse_start(arguments.start or ""), read_map_server(arguments.map)
+    start, grid = parse_start(arguments.start or ""), open_grid(arguments.map)
     check_start(start, grid)
     robot = open_noting(arguments.source)
     say_about_compiling()

@@ -26,7 +26,11 @@ stereovox ros2 --scan /scan --out floor.yaml"""
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     topics = (
-        ("depth", "TOPIC[=INFO]", "depth images (16UC1, 32FC1, .../compressedDepth), and their camera_info"),
+        (
+            "depth",
+            "TOPIC[=INFO]",
+            "depth images (16UC1, 32FC1, .../compressedDepth, .../compressed), and their camera_info",
+        ),
         ("cloud", "TOPIC", "point clouds"),
         ("scan", "TOPIC", "laser scans"),
         ("odometry", "TOPIC", "poses as nav_msgs/Odometry, besides /tf"),

@@ -150,6 +150,8 @@ class LidarPoses(PoseSource):
 
     def _localising(self, node: Any, config: Config, options: Options) -> MapLocalization:
         floor = read_map_server(options.poses)
+        if floor.note:
+            node.get_logger().warning(f"{options.poses}: {floor.note}")
         found = MapLocalization(floor, config, parse_start(options.start, "ros.start"))
         self._server.show(floor, node.get_clock().now().nanoseconds)
         return found

@@ -76,7 +76,7 @@ class Bag(DepthSource):
 
     Realsense-viewer writes `.db3` since librealsense 2.57 and `.bag` before; both are recognised by their topics and
     contain camera, unit and baseline. In ordinary bags the depth topic has 16UC1 (millimetres), 32FC1 (metres) or
-    compressedDepth images, and `camera_info` next to it. If there are several, `?depth=/topic` selects one.
+    compressedDepth images, 16-bit PNG, and `camera_info` next to it. If there are several, `?depth=/topic` selects one.
 
     The files are read message by message, not played back by pyrealsense2, which plays at its own pace, cannot go to
     frame number i, and may crash the program on a damaged file. Checked: `.db3` against files that

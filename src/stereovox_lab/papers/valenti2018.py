@@ -11,6 +11,7 @@ from typing import Any
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.lidar_truth import FREE
 from stereovox_lab.papers.chapter import Chapter, Progress
+from stereovox_lab.papers.formulas.audit import formulas
 from stereovox_lab.papers.output import Steps, output_files, write_result
 from stereovox_lab.papers.valenti.apart import apart
 from stereovox_lab.papers.valenti.chapters import drive_chapter, speed_chapter, table_chapter
@@ -59,7 +60,7 @@ def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progres
         raise StereovoxError("valenti2018 needs recordings: --data DIR with KITTI tracking sequences or a raw drive")
     start = perf_counter()
     drives, files = find_drives(data), output_files(out)
-    found = experiments(drives, QUICK if quick else FULL, progress)
+    found = [*experiments(drives, QUICK if quick else FULL, progress), formulas("valenti2018")]
     seconds = perf_counter() - start
     return write_result(files, found, seconds, paper="valenti2018", title=TITLE, lead=LEAD, quick=quick, heads=HEADS)
 

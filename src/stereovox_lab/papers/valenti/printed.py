@@ -93,18 +93,6 @@ def better(name: str, ours: float, printed: float) -> bool:
     return ours < printed if name == "error" else ours > printed
 
 
-def own_claims() -> list[Claim]:
-    """Return, for each kind of figure, whether the printed ones agree with their row's counts."""
-    off = misprints()
-    claims = []
-    for name in COUNTED:
-        wrong = [f"{sequence}: {value:.3f}" for (sequence, what), value in off.items() if what == name]
-        ours = f"by their counts {', '.join(wrong)}" if wrong else "all ten do"
-        claims.append(Claim(f"printed {name} agrees with the row's own counts", "ten rows", ours, not wrong))
-    why = "cannot be derived from the counts"
-    return [*claims, *(Claim(f"printed {name}", "ten rows", "-", None, why) for name in RATES if name not in COUNTED)]
-
-
 def drive_claims(judged: Iterable[Judged], kind: str) -> list[Claim]:
     """Return the claims on each figure of each drive; judged: at one setting. kind: of truth."""
     claims = []

@@ -48,8 +48,8 @@ PRINTED: dict[str, Any] = {
     "depth.downsample": 8, "depth.denoise": False, "sensor.model": "andert", "sensor.k": 0.05,
     "sensor.p_free": 0.25, "sensor.p_max": 0.93, "map.log_odds_min": -2.1, "map.log_odds_max": 2.1,
     "noise.subpixel": 0.08, "noise.default_baseline": 0.05, "map.cell": "uint8", "map.prior": 0.5,
-    "map.free_below": 0.3, "map.occupied_above": 0.7, "window.size": [20.0, 6.0, 20.0], "window.trigger": 1.0, "window.outside": "drop",
-    "ray.update": "every",
+    "map.free_below": 0.3, "map.occupied_above": 0.7, "window.size": [20.0, 6.0, 20.0], "window.trigger": 1.0,
+    "window.outside": "drop", "ray.update": "every",
 }  # fmt: skip
 
 

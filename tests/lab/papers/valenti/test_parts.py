@@ -216,11 +216,11 @@ def test_better_in_every_measure_means_every_one():
     assert not claims[0].holds  # OctoMap's map is the better one
 
 
-def test_speed_is_claimed_of_default_only():
+def test_speed_is_a_figure_without_a_verdict():
     times = {"match": {"median": 20.0}, "map": {"median": 3.0}}
-    holds = [speed_claim(Speed(name, SETTING, "8x8", 5, hertz, times, 2)).holds
-             for name, hertz in ((DEFAULT, 21.0), (DEFAULT, 19.9), (THESIS, 99.0))]  # fmt: skip
-    assert holds == [True, False, None]
+    claim = speed_claim(Speed(DEFAULT, SETTING, "8x8", 5, 19.9, times, 2))
+    assert (claim.holds, claim.unjudged) == (None, "")
+    assert claim.ours == "19.9 Hz on 2 cores (median ms: match 20.0, map 3.0)"
 
 
 def test_octomap_gets_hits_in_range_and_clears_the_way_to_what_is_beyond():

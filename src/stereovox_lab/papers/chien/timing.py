@@ -38,7 +38,7 @@ STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", 
 FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
 MEANS = (
     "Times are of the processor, by one thread; they are figures and no claims, because the machines differ. Means are "
-    "given because the thesis gives averages. Its frame includes reading the cameras and extracting a point cloud; ours "
+    "given, as in the thesis. Its frame includes reading the cameras and extracting a point cloud, ours "
     "begins with the raw image in memory, and no point cloud is made."
 )
 VIEWS = (

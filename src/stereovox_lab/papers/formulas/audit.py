@@ -17,10 +17,10 @@ METHOD = (
     "differ as the claim says."
 )
 AUDIT = (
-    "The audit applies one fault at a time to stereovox and runs all these claims again. A fault that no claim notices "
-    "must be explained. 'Settings alone': only the table of the profile's settings shows it."
+    "The audit applies one fault at a time to stereovox and runs all these claims again. A fault that no claim "
+    "notices, or the table of the profile's settings alone, is explained."
 )
-HEADS = ("fault", "claims that fall", "first of them", "must fall")
+HEADS = ("fault", "claims that fall", "first of them", "must fall", "why no map shows it")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Outcome:
     @property
     def as_expected(self) -> bool:
         """Whether it was noticed, or survived as explained."""
-        return not self.fallen if self.mutant.survives else self.noticed
+        return self.noticed if self.mutant.falls else not self.fallen
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def formulas(paper: str, audit: bool = False, step: Callable[[], None] = lambda:
     if audit:
         found += audit_claims(found, outcomes)
         sheets.append(Sheet("One fault at a time", HEADS, [_row(one) for one in outcomes]))
-    numbers = {"faults": [{"fault": one.mutant.what, "falls": list(one.shown), "survives": one.mutant.survives}
+    numbers = {"faults": [{"fault": one.mutant.what, "falls": list(one.shown), "why": one.mutant.why}
                           for one in outcomes]}  # fmt: skip
     return Chapter(
         "formulas", "Formulas", f"{METHOD} {AUDIT}" if audit else METHOD, found, sheets=sheets, numbers=numbers
@@ -94,7 +94,7 @@ def steps(paper: str) -> int:
 def audit_claims(found: Sequence[Claim], outcomes: Sequence[Outcome]) -> list[Claim]:
     """Return the claims on the audit: no fault survives unexplained, and no claim withstands them all."""
     wrong = [one.mutant.what for one in outcomes if not one.as_expected]
-    explained = sum(bool(one.mutant.survives) for one in outcomes)
+    explained = sum(not one.mutant.falls for one in outcomes)
     fallen = {text for one in outcomes for text in one.fallen}
     firm = [claim.text for claim in found if claim.holds is not None and claim.text not in fallen]
     return [
@@ -105,7 +105,7 @@ def audit_claims(found: Sequence[Claim], outcomes: Sequence[Outcome]) -> list[Cl
 
 
 def _row(one: Outcome) -> tuple[str, ...]:
-    if not one.fallen:
-        return one.mutant.what, "0", f"survives: {one.mutant.survives or 'NOT EXPLAINED'}", one.mutant.falls
-    alone = all(map(_of_settings, one.fallen))
-    return one.mutant.what, str(len(one.fallen)), "settings alone" if alone else one.shown[0], one.mutant.falls
+    shown = one.shown[0] if one.fallen else "none"
+    if one.fallen and all(map(_of_settings, one.fallen)):
+        shown = "settings alone"
+    return one.mutant.what, str(len(one.fallen)), shown, one.mutant.falls or "none", one.mutant.why

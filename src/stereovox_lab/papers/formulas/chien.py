@@ -201,8 +201,9 @@ def _along_ray() -> Claim:
     ours, hits = frame_log_odds(T, small, low, line_drawing)
     theirs, _ = frame_log_odds(T, small, low, line_drawing, along_ray=True)
     off = int((np.abs(PER_LOG_ODDS * (ours - theirs))[hits] > BYTES).sum())
+    changed = int(((127 + PER_LOG_ODDS * ours > 180) != (127 + PER_LOG_ODDS * theirs > 180)).sum())
     text = "Alg 3 with sigma along the ray in the height of the peak, too: cells with points that would differ"
-    found = f"{off:,} of {hits.sum():,} by more than {BYTES} bytes"
+    found = f"{off:,} of {hits.sum():,} by more than {BYTES} bytes; {changed} change between occupied and not"
     return Claim(text, "not mapped so (docs/formulas.md)", found, None)
 
 

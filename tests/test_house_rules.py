@@ -28,9 +28,9 @@ MOST = {
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
-    "modules of the laboratory": 80,
-    "lines of the laboratory": 11_500,
-    "words of README and docs": 38_050,
+    "modules of the laboratory": 86,
+    "lines of the laboratory": 12_850,
+    "words of README and docs": 38_550,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

@@ -87,6 +87,28 @@ def test_with_rays_free_are_only_cells_on_the_way_to_a_point(tmp_path):
     assert set(by_rays.state(on_way)) <= {State.FREE, State.OCCUPIED}
 
 
+def test_with_box_free_are_all_other_cells_round_those_in_view(tmp_path):
+    source = open_source(made.raw(tmp_path))
+    by_view, (by_box, counts) = lidar_truth(source, SIZE, RANGE)[0], lidar_truth(source, SIZE, RANGE, "box")
+    known = by_view.cells()[0]
+    low, high = known.min(axis=0), known.max(axis=0) + 1
+    assert counts.free + counts.occupied == np.prod(high - low)
+    inside = np.stack(np.meshgrid(*map(np.arange, low - 1, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
+    held = ((inside >= low) & (inside < high)).all(axis=1)
+    states = by_box.state((inside + 0.5) * SIZE)
+    assert set(states[held]) == {State.FREE, State.OCCUPIED}
+    assert set(states[~held]) == {State.UNKNOWN}
+    assert occupied(by_view) <= occupied(by_box)
+    for cell in occupied(by_box) - occupied(by_view):  # of points beyond the range of all frames
+        assert by_view.state([(np.array(cell) + 0.5) * SIZE])[0] == State.UNKNOWN
+
+
+def test_a_box_of_too_many_cells_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("stereovox.evaluate.lidar_truth.MAX_BOX", 100)
+    with pytest.raises(StereovoxError, match="use larger ones"):
+        lidar_truth(open_source(made.raw(tmp_path)), SIZE, RANGE, "box")
+
+
 def test_points_in_annotated_boxes_are_dropped(tmp_path):
     training = made.tracking(tmp_path)
     with_labels, counts = lidar_truth(open_source(training), SIZE, RANGE)

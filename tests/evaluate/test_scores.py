@@ -114,6 +114,16 @@ def test_a_perfect_and_a_silent_map():
     assert (nothing.auc, nothing.observed_auc, nothing.observed.accuracy) == (pytest.approx(0.5), None, None)
 
 
+def test_correlation_is_given_with_unobserved_cells_at_one_half_and_as_free():
+    truth = {(x, 0, 0): x < 2 for x in range(6)}
+    found = score(made({(0, 0, 0): 2.0, (2, 0, 0): -2.0}), made_truth(truth))
+    high, low, actual = 1 / (1 + np.exp(-2.0)), 1 / (1 + np.exp(2.0)), [1, 1, 0, 0, 0, 0]
+    at_half, as_free = ([high, other, low, other, other, other] for other in (0.5, 0.0))
+    assert found.correlation == pytest.approx(np.corrcoef(at_half, actual)[0, 1], abs=1e-3)
+    assert found.correlation_free == pytest.approx(np.corrcoef(as_free, actual)[0, 1], abs=1e-3)
+    assert found.observed.correlation_free == found.observed.correlation
+
+
 def test_a_tentative_cell_of_the_truth_is_not_judged():
     found = score(made({(0, 0, 0): 2.0, (1, 0, 0): 2.0}), made({(0, 0, 0): 0.1, (1, 0, 0): 3.0}))
     assert (found.cells, found.tp, found.fp) == (1, 1, 0)

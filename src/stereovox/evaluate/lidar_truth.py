@@ -33,7 +33,9 @@ AT_ONCE = 2048
 """Blocks processed together, so that their intermediate arrays stay in the cache."""
 OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
-FREE = ("view", "rays")
+FREE = ("view", "rays", "box")
+MAX_BOX = 1 << 28
+"""Most cells of a box that is free as a whole."""
 IN_VIEW, CROSSED, HIT = 1, 2, 4
 """Marks of a cell: in view and range of a frame; crossed by a lidar ray; hit by a point."""
 
@@ -199,19 +201,20 @@ def lidar_truth(
     axis. Such a cell is occupied if at least one lidar point of any frame is in it, inside the left image, outside
     every annotated box (enlarged by `box_margin` metres) and not on a moving object; lidar is as accurate far away, so
     a point beyond the range of its own frame counts for another frame within range. All others are free (`view`), or
-    only those crossed by a lidar ray (`rays`). The rest is unknown. Points are not weighed against rays through the
-    same cell: one point is enough.
+    only those crossed by a lidar ray (`rays`). The rest is unknown. With `box`, as in Valenti 2018, Table 8.1, all
+    cells of the box round those in view count, along the axes, as if they were in view. Points are not weighed
+    against rays through the same cell: one point is enough.
     frames: which frames, as `A:B:S` or numbers; None: all. Their images are not read. watch(numbers, count) yields the
     numbers again, for a progress bar.
     Raises SourceError if the source has no lidar or no usable scan, StereovoxError for bad values.
     """
     if free not in FREE:
-        raise StereovoxError(f"free '{free}' is not known; say {' or '.join(FREE)}")
+        raise StereovoxError(f"free '{free}' is not known; say {', '.join(FREE[:-1])} or {FREE[-1]}")
     if not 0 <= box_margin < 100:
         raise StereovoxError(f"box margin {box_margin:g} must be 0 or more metres, and less than 100")
     config = load_config(voxel_size=voxel_size, max_range=max_range)
     picked = _picked(source, frames)
-    truth = _Truth(source, config, free == "rays", box_margin)
+    truth = _Truth(source, config, free, box_margin)
     for i in watch(picked, len(picked)) if watch else picked:
         truth.add(i)
     return truth.map(), truth.counts
@@ -220,8 +223,9 @@ def lidar_truth(
 class _Truth:
     """Marks of all cells so far."""
 
-    def __init__(self, source: LidarSource, config: Config, rays: bool, box_margin: float):
-        self.source, self.config, self.rays, self.box_margin = source, config, rays, box_margin
+    def __init__(self, source: LidarSource, config: Config, free: str, box_margin: float):
+        self.source, self.config, self.box_margin = source, config, box_margin
+        self.rays, self.box = free == "rays", free == "box"
         self.counts = TruthCounts()
         self._marks = BlockPool(np.uint8)
         self._last: Viewpoint | None = None
@@ -293,11 +297,32 @@ class _Truth:
 
     def _cells(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return all blocks (n, 3) with their cells (n, 512) as a map stores them."""
+        if self.box:
+            self._mark_box()
         n, form, limits = len(self._marks), VoxelMap(self.config).storage.cell_format, self.config.map
         free = IN_VIEW | CROSSED if self.rays else IN_VIEW
         log_odds = np.array([limits.log_odds_min if marks & free == free else 0.0 for marks in range(2 * HIT)])
         log_odds[[HIT | IN_VIEW, HIT | IN_VIEW | CROSSED]] = limits.log_odds_max
         return self._marks.coords[:n], form.stored(log_odds).astype(form.dtype)[self._marks.values[:n]]
+
+    def _mark_box(self) -> None:
+        """Mark all cells of the box round those in view as in view, too."""
+        n = len(self._marks)
+        block, cell = np.nonzero(self._marks.values[:n] & IN_VIEW)
+        cells = self._marks.coords[block] * SIDE + np.stack([cell >> 6, (cell >> 3) & 7, cell & 7], axis=1)
+        low, high = cells.min(axis=0), cells.max(axis=0) + 1
+        if np.prod(high - low, dtype=float) > MAX_BOX:
+            raise StereovoxError(
+                f"free 'box': {np.prod(high - low, dtype=float):.2g} cells are too many; use larger ones"
+            )
+        axes = [np.arange(a // SIDE, -(-b // SIDE)) for a, b in zip(low, high, strict=True)]
+        inside = [(SIDE * axis[:, None] + np.arange(SIDE) >= a) & (SIDE * axis[:, None] + np.arange(SIDE) < b)
+                  for axis, a, b in zip(axes, low, high, strict=True)]  # fmt: skip
+        for i, x in enumerate(axes[0]):
+            blocks = np.stack(np.meshgrid([x], *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3)
+            every = np.einsum("a,jb,kc->jkabc", inside[0][i], inside[1], inside[2]).reshape(len(blocks), -1)
+            places = self._marks.insert(blocks.astype(np.int32))
+            self._marks.values[places] |= np.where(every, np.uint8(IN_VIEW), np.uint8(0))
 
 
 def _picked(source: LidarSource, frames: str | Iterable[int] | None) -> list[int]:

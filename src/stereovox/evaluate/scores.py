@@ -27,7 +27,8 @@ class Tally:
     """Measures over one set of cells; None for a division by zero.
 
     cells: their number; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6;
-    correlation: Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells
+    correlation: Pearson's, of probability and truth (Eq 8.8-8.9, divided by N), unobserved cells at 0.5;
+    correlation_free: the same with them at 0, which is free (Eq 8.1); tolerance_precision: share of the cells
     called occupied with a surface within the tolerance; tolerance_recall: share of the surface cells with a cell called
     occupied within it, anywhere; iou: intersection over union of both sets, tp / (tp + fp + fn).
     """
@@ -45,6 +46,7 @@ class Tally:
     tolerance_precision: float | None
     tolerance_recall: float | None
     correlation: float | None
+    correlation_free: float | None
     iou: float | None
 
 
@@ -178,8 +180,10 @@ def score_reading(reading: Reading, truth: TruthCells, threshold: float = 0.7, b
     seen, p, actual = reading.observed, reading.probability, truth.occupied
     marked, found = reading.marked(threshold), reading.found(threshold)
     close = ratio(float((marked & truth.near).sum()), float(marked.sum()))
-    over_all = _tally(marked, actual, found, p, close)
-    over_seen = over_all if seen.all() else _tally(marked[seen], actual[seen], found[seen[actual]], p[seen], close)
+    over_all = _tally(marked, actual, found, p, seen, close)
+    over_seen = over_all
+    if not seen.all():
+        over_seen = _tally(marked[seen], actual[seen], found[seen[actual]], p[seen], seen[seen], close)
     error = brier(p[seen], actual[seen])
     return QuickScores(
         **vars(over_all),
@@ -198,9 +202,13 @@ def _tally(
     actual: NDArray[np.bool_],
     found: NDArray[np.bool_],
     p: NDArray[np.float64],
+    seen: NDArray[np.bool_],
     close: float | None,
 ) -> Tally:
-    """Compute the measures over N cells; found: (S,) for each truly occupied one; close: the tolerance precision."""
+    """Compute the measures over N cells, those `seen` by the map and others.
+
+    found: (S,) for each truly occupied one; close: the tolerance precision.
+    """
     counted = Confusion.count(marked, actual)
     return Tally(
         cells=len(actual),
@@ -212,5 +220,6 @@ def _tally(
         tolerance_precision=close,
         tolerance_recall=ratio(float(found.sum()), len(found)),
         correlation=correlation(p, actual),
+        correlation_free=correlation(np.where(seen, p, 0.0), actual),
         iou=ratio(counted.tp, counted.tp + counted.fp + counted.fn),
     )

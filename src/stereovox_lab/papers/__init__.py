@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from stereovox.errors import StereovoxError, did_you_mean
@@ -28,6 +29,7 @@ def reproduce(
     data: str | Path | None = None,
     quick: bool = False,
     camera: str | None = None,
+    audit: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Reproduce the experiments of a paper and write `report.html` and `numbers.json` into folder `out`.
@@ -36,14 +38,28 @@ def reproduce(
     valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: your own bag,
     instead of the simulated ones).
     quick: fewer frames; enough to check that all works, not to quote. camera: of the simulated recordings (chien2020),
-    as in their options: `simple`, `d435`, `kinect`. Returns the numbers, fit for JSON.
+    as in their options: `simple`, `d435`, `kinect`. audit: only the claims on
+    formulas, and which of them fall under each of many faults. Returns the numbers, fit for JSON.
     Raises StereovoxError, one line, for an unknown paper or camera.
     """
     if paper not in PAPERS:
         raise StereovoxError(f"unknown paper '{paper}'{did_you_mean(paper, PAPERS)}")
+    progress = progress or (lambda done, total, text: None)
+    if audit:
+        return _audit(paper, Path(out), progress)
     module, _, name = PAPERS[paper].partition(":")
     run: Callable[..., dict[str, Any]] = getattr(import_module(module), name)
-    return run(Path(out), data, quick, progress or (lambda done, total, text: None), **_camera(paper, camera))
+    return run(Path(out), data, quick, progress, **_camera(paper, camera))
+
+
+def _audit(paper: str, out: Path, progress: Progress) -> dict[str, Any]:
+    from stereovox_lab.papers.formulas.audit import formulas, steps
+    from stereovox_lab.papers.output import Steps, output_files, write_result
+
+    start, files = perf_counter(), output_files(out)
+    found = formulas(paper, True, Steps(progress, steps(paper)).of("faults"))
+    title = f"Formulas of {paper}, audited"
+    return write_result(files, [found], perf_counter() - start, paper=paper, title=title, lead="", quick=False)
 
 
 def _camera(paper: str, camera: str | None) -> dict[str, str]:

@@ -21,6 +21,7 @@ from stereovox_lab.papers.chien.own import map_own
 from stereovox_lab.papers.chien.shifting import OUTSIDE, fly
 from stereovox_lab.papers.chien.timing import FIRST, time_tables
 from stereovox_lab.papers.chien.tracers import compare_tracers
+from stereovox_lab.papers.formulas.audit import formulas
 from stereovox_lab.papers.output import Steps, output_files, write_result
 
 TITLE = "Reproduction of Chien 2020"
@@ -70,7 +71,7 @@ def reproduce(
     sizes = QUICK if quick else Sizes()
     steps = Steps(progress, _total(sizes) + (0 if source is None else len(source)))
     own = [] if source is None else [map_own(source, steps.of("your own recording"))]  # first: it may be unusable
-    found = [*experiments(sizes, steps, camera), *own]
+    found = [*experiments(sizes, steps, camera), *own, formulas("chien2020")]
     lead = f"{LEAD} {NOISE[camera]}"
     result = write_result(files, found, perf_counter() - start, paper="chien2020", title=TITLE, lead=lead, quick=quick)
     return {**result, "camera": camera}

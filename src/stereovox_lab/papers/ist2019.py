@@ -14,6 +14,7 @@ from typing import Any
 from stereovox.opening import open_robot
 from stereovox.sources.robots.robot import Robot
 from stereovox_lab.papers.chapter import Chapter, Progress
+from stereovox_lab.papers.formulas.audit import formulas
 from stereovox_lab.papers.ist.chapters import fans_chapter, floor_chapter, time_chapter
 from stereovox_lab.papers.ist.drives import PLACES, Drive, Extent, Place, Recording, messages, record
 from stereovox_lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
@@ -58,6 +59,7 @@ def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progres
     files = output_files(out)
     sizes = QUICK if quick else Sizes()
     found = own(robot, out, sizes, progress) if robot else floors(out, sizes, progress)
+    found.append(formulas("ist2019"))
     lead = LEAD if robot is None else OWN
     seconds = perf_counter() - start
     result = write_result(files, found, seconds, paper="ist2019", title=TITLE, lead=lead, quick=quick, heads=HEADS)

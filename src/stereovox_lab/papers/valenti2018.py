@@ -9,12 +9,12 @@ from time import perf_counter
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.lidar_truth import FREE
 from stereovox_lab.papers.chapter import Chapter, Progress
+from stereovox_lab.papers.formulas.audit import formulas
 from stereovox_lab.papers.output import Steps, output_files, write_result
 from stereovox_lab.papers.valenti.apart import apart
 from stereovox_lab.papers.valenti.chapters import drive_chapter, speed_chapter, table_chapter
-from stereovox_lab.papers.valenti.judge import Judged, judge
+from stereovox_lab.papers.valenti.judge import Judged, judge, kinds
 from stereovox_lab.papers.valenti.mappers import (
     DEFAULT,
     MAPPERS,
@@ -59,7 +59,7 @@ def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progres
         raise StereovoxError("valenti2018 needs recordings: --data DIR with KITTI tracking sequences or a raw drive")
     start = perf_counter()
     drives, files = find_drives(data), output_files(out)
-    found = experiments(drives, QUICK if quick else FULL, progress)
+    found = [*experiments(drives, QUICK if quick else FULL, progress), formulas("valenti2018")]
     seconds = perf_counter() - start
     return write_result(files, found, seconds, paper="valenti2018", title=TITLE, lead=LEAD, quick=quick, heads=HEADS)
 
@@ -94,5 +94,5 @@ def experiments(drives: list[Drive], extent: Extent, progress: Progress) -> list
 
 
 def _total(frames: list[list[int]], extent: Extent) -> int:
-    passes = len(extent.settings) * (len(FREE) + 2)
+    passes = sum(len(kinds(setting == TABLE)) + 2 for setting in extent.settings)
     return passes * sum(map(len, frames)) + 4 * min(len(frames[0]), MAX_FRAMES)

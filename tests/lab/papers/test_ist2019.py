@@ -82,7 +82,7 @@ def test_a_bag_of_ones_own_needs_no_truth(tmp_path, capsys):
     words = ["reproduce", "ist2019", "--data", str(tmp_path / "mine.bag"), "--out", str(tmp_path / "out"), "--quick"]
     assert main(words) == 0
     numbers = json.loads((tmp_path / "out/numbers.json").read_text())["experiments"]
-    assert list(numbers) == ["simulation", "own", "table1"]
+    assert list(numbers) == ["simulation", "own", "table1", "formulas"]
     told = numbers["own"]["numbers"]
     assert told["slam_way"] is None
     assert told["reference_of_building"] is None

@@ -49,6 +49,7 @@ def test_the_page_says_what_holds_and_needs_no_other_file():
 @pytest.fixture
 def one_chapter(monkeypatch):
     monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps, camera: [CHAPTER])
+    monkeypatch.setattr(chien2020, "formulas", lambda paper: Chapter("formulas", "Formulas", paper, []))
 
 
 def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):

@@ -38,9 +38,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_usual(parser, "frames")
     parser.add_argument(
         "--free",
-        choices=("view", "rays"),
+        choices=("view", "rays", "box"),
         default="view",
-        help="free cells: all others in view of a frame (view), or only those of them that a lidar ray crosses (rays)",
+        help="free cells: all others in view of a frame (view), only those of them that a lidar ray crosses (rays), or "
+        "all others of the box round them (box: Valenti 2018, Table 8.1)",
     )
     parser.add_argument(
         "--box-margin", type=float, default=0.0, metavar="M", help="metres by which annotated boxes are enlarged (0)"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,9 @@ VIEW_EVERY = 5
 STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
 FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
 MEANS = (
-    "Means are compared because the thesis gives averages; whatever else the machine does makes them larger, the "
-    "median less so. The thesis's frame includes reading the cameras and extracting a point cloud; ours begins with "
-    "the raw image in memory, and no point cloud is made."
+    "Times are of the processor, by one thread; they are figures and no claims, because the machines differ. Means are "
+    "given, as in the thesis. Its frame includes reading the cameras and extracting a point cloud, ours "
+    "begins with the raw image in memory, and no point cloud is made."
 )
 VIEWS = (
     "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
@@ -164,10 +164,10 @@ class _Steps:
         return [_timed(step, self._ms[step.name]) for step in STEPS]
 
     def _time(self, name: str, counted: bool, function: Callable[..., Any], *arguments: Any) -> Any:
-        start = perf_counter()
+        start = process_time()
         result = function(*arguments)
         if counted:
-            self._ms[name].append(1e3 * (perf_counter() - start))
+            self._ms[name].append(1e3 * (process_time() - start))
         return result
 
 
@@ -183,12 +183,12 @@ class _Condition:
     def add(self, batch: Sequence[Frame], counted: bool) -> None:
         for n, frame in enumerate(batch):
             shown = not self._condition.views or n % VIEW_EVERY == 0
-            start = perf_counter()
+            start = process_time()
             self._mapper.add(frame)
             if shown:
                 self._show()
             if counted and shown:
-                self._ms.append(1e3 * (perf_counter() - start))
+                self._ms.append(1e3 * (process_time() - start))
 
     def timed(self) -> Timed:
         return _timed(self._condition, self._ms)
@@ -263,8 +263,7 @@ def _claim(row: Timed) -> Claim | None:
     thesis = row.row.thesis_ms
     if thesis is None:
         return None
-    return Claim(f"{row.row.name}: no slower than the thesis", f"{thesis:.2f} ms", f"{row.mean_ms:.2f} ms",
-                 row.mean_ms <= thesis)  # fmt: skip
+    return Claim(row.row.name, f"{thesis:.2f} ms", f"{row.mean_ms:.2f} ms", None)
 
 
 def _step(row: Timed) -> tuple[str, ...]:

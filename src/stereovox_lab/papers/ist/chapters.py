@@ -210,30 +210,29 @@ def time_chapter(many: Fan, surveys: Sequence[tuple[Place | None, Survey]], publ
         ms = [f"{update_ms(found, name) / 1e3:.5f}" for name in (THEIRS, OURS)]
         rows.append((place.title if place else found.recording.name, f"{place.update_s:.3f}" if place else "-", *ms))
     heads = ("dataset", "report", "ours, ist2019", "ours, default")
-    claims = [_quicker(place, found) for place, found in surveys if place]
+    claims = [_update(place, found) for place, found in surveys if place]
     if published:
         whole = published.picture + published.message
         claims.append(
             Claim(
-                f"publishing a map of {published.side} x {published.side} cells takes less than in the report",
+                f"publishing a map of {published.side} x {published.side} cells",
                 "15 s",
                 f"{whole:.2f} s: {published.picture:.3f} s for the picture, {published.message:.2f} s into a bag",
-                whole < 15,
+                None,
             )
         )
     method = (
         "Median seconds from depth image (simulation: scan) to updated map, without reading the file and without "
-        "publishing, on this machine; the report used a 2.8 GHz Core i7 and Python."
+        "publishing, on this machine; the report used a 2.8 GHz Core i7 and Python. They are figures and no claims."
     )
     numbers = {"rows": rows, "publish": vars(published) if published else None}
     sheet = Sheet("Table I, seconds an update", heads, rows)
     return Chapter("table1", "Table I: time", method, claims, sheets=[sheet], numbers=numbers)
 
 
-def _quicker(place: Place, found: Survey) -> Claim:
+def _update(place: Place, found: Survey) -> Claim:
     ms = update_ms(found, THEIRS)
-    text = f"{place.title}: an update takes less time than in the report"
-    return Claim(text, f"{place.update_s:.3f} s", f"{ms / 1e3:.4f} s", ms / 1e3 < place.update_s)
+    return Claim(f"{place.title}: an update", f"{place.update_s:.3f} s", f"{ms / 1e3:.4f} s", None)
 
 
 def _method(found: Survey, place: Place | None) -> str:

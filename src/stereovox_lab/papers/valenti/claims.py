@@ -66,11 +66,11 @@ def claims_of(maps: Sequence[Apart]) -> list[Claim]:
 
 
 def speed_claim(speed: Speed) -> Claim:
-    """Return claim (g); a verdict for `default` only."""
+    """Return (g), a figure without a verdict: it depends on the machine and on what else that does."""
     parts = ", ".join(f"{name} {times['median']:.1f}" for name, times in speed.ms.items())
     text = f"(g) {speed.profile}, {speed.setting}: stereo pair {speed.image} to updated map on 2 cores"
     ours = f"{speed.hertz:.1f} Hz on {speed.cores} core{'s' * (speed.cores != 1)} (median ms: {parts})"
-    return Claim(text, f"at least {HERTZ:g} Hz", ours, speed.hertz >= HERTZ if speed.profile == DEFAULT else None)
+    return Claim(text, f"at least {HERTZ:g} Hz on an idle machine", ours, None)
 
 
 def results(found: Found, setting: Setting, mapper: str, kind: str) -> list[Result]:

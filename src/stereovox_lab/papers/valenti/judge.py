@@ -24,6 +24,8 @@ from stereovox_lab.papers.valenti.street import halves
 
 TOLERANCE = 1
 """Cells."""
+BOX = "box"
+"""The kind of truth whose cells are those of Valenti 2018, Table 8.1: of the whole box."""
 Halves = Mapping[str, tuple[TruthCells, TruthCells]]
 """By the kind of truth: its parts at the first and second half of a path."""
 
@@ -65,9 +67,11 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """One map of one drive. scores: by the kind of truth, `view` and `rays`, see `lidar_truth`.
+    """One map of one drive. scores: by the kind of truth, `view` and `rays`, see `lidar_truth`; also `box`, if the map
+    was scored after every frame.
 
-    halves: likewise for the street's first and second half; None if not requested, or if the path is too short.
+    halves: likewise, without `box`, for the street's first and second half; None if not requested, or if the path is
+    too short.
     series: measures against the frame, truth `view` (Valenti 2018, Fig 8.4), and shown: cells for a picture; both None
     if not requested.
     """
@@ -106,10 +110,10 @@ def judge(
     """Return the result of each mapper, and the counts of the lidar's points.
 
     numbers: frames of the drive; matched: their depth images, by profile. every_frame: also score each map after
-    every frame. halved: also score both halves of the street. step: called after each frame of each pass: one pass for
-    each kind of truth and each profile.
+    every frame, and in the end over the whole box. halved: also score both halves of the street. step: called after
+    each frame of each pass: one pass for each kind of truth and each profile.
     """
-    truths, counts = _truths(drive, numbers, setting, step)
+    truths, counts = _truths(drive, numbers, setting, kinds(every_frame), step)
     parts = _halves(truths, _way(drive, numbers)) if halved else None
     found = []
     for profile, frames in matched.items():
@@ -129,8 +133,13 @@ def judge(
     return sorted(found, key=lambda one: order.index(one.mapper)), counts
 
 
+def kinds(every_frame: bool) -> tuple[str, ...]:
+    """Return the kinds of truth that `judge` uses."""
+    return FREE if every_frame else tuple(kind for kind in FREE if kind != BOX)
+
+
 def _truths(
-    drive: Drive, numbers: Sequence[int], setting: Setting, step: Callable[[], None]
+    drive: Drive, numbers: Sequence[int], setting: Setting, wanted: Iterable[str], step: Callable[[], None]
 ) -> tuple[dict[str, TruthCells], dict[str, Any]]:
     def watched(picked: Iterable[int], count: int) -> Iterable[int]:
         for i in picked:
@@ -138,7 +147,7 @@ def _truths(
             step()
 
     truths, counts = {}, {}
-    for kind in FREE:
+    for kind in wanted:
         truth, about = lidar_truth(drive, *setting, kind, numbers, watch=watched)
         truths[kind], counts[kind] = TruthCells(truth, TOLERANCE), about.as_dict()
     return truths, counts
@@ -157,6 +166,8 @@ def _halves(truths: Mapping[str, TruthCells], way: NDArray[np.float64]) -> Halve
     """Return each truth at the first and second half of the path; None if one of them has no surface."""
     found = {}
     for kind, truth in truths.items():
+        if kind == BOX:
+            continue
         parts = halves(way, truth.centers())
         if not all(truth.occupied[part].any() for part in parts):
             return None

@@ -23,14 +23,14 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 602,
-    "lines": 90_900,
+    "modules": 603,
+    "lines": 91_150,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 86,
     "lines of the laboratory": 12_850,
-    "words of README and docs": 38_550,
+    "words of README and docs": 48_150,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

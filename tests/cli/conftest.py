@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands as a user calls them, and what they tell."""
+"""Commands as a user calls them, and their output."""
 
 import pytest
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands say of maps in boxes, in folders and in object stores, what they say of a map in one piece."""
+"""Commands give the same answers for maps in boxes, in folders and in object stores, as for a map in one piece."""
 
 import json
 import warnings

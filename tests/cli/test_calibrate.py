@@ -25,7 +25,7 @@ def last_json(capsys):
 
 
 def spread_of_the_wall(map_folder):
-    """How far the hit cells reach along the optical axis (the world's x)."""
+    """Extent of the hit cells along the optical axis (the world's x)."""
     return np.ptp(sv.load_map(map_folder).occupied()[:, 0])
 
 

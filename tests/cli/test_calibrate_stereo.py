@@ -35,9 +35,9 @@ def test_boards_become_a_rig_file_and_a_report(tmp_path, capsys):
     told = json.loads(streams.out.splitlines()[-1])
     assert told["used"] == 4
     assert told["out"] == str(out)
-    assert "99: left out, no board of 7x5 inner corners in left99.png and right99.png" in streams.err
+    assert "99: skipped, no board of 7x5 inner corners in left99.png and right99.png" in streams.err
     assert "rows after rectification" in streams.err
-    assert "note: no partner of the other eye for left77.png\n" in streams.err
+    assert "note: no image of the other eye for left77.png\n" in streams.err
     assert told["unmatched"] == ["left77.png"]
     assert "millimetres" not in streams.err
     (pair,) = read_rig(out).pairs

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps that are saved while they are made: when, what a disk without room leaves, and runs that are killed."""
+"""Maps that are saved while they grow: when, on full disks, and in runs that are killed."""
 
 import json
 import signal
@@ -33,7 +33,7 @@ def names(folder):
 
 
 class Clock:
-    """Seconds that pass only where a test says so."""
+    """Seconds that pass only when a test says so."""
 
     def __init__(self):
         self.now = 100.0
@@ -213,7 +213,7 @@ def test_going_on_with_other_frames_is_refused(tmp_path, capsys):
     assert mapped(tmp_path / "m", "--frames", ":20:2") == 0
     before = load_map(tmp_path / "m").storage.blocks()
     assert mapped(tmp_path / "m", "--resume") == 2
-    assert "frame 18', here it is" in (said := capsys.readouterr().err)
+    assert "frame 18', but here it is" in (said := capsys.readouterr().err)
     assert "choose frames as before" in said
     for one, other in zip(load_map(tmp_path / "m").storage.blocks(), before, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -268,7 +268,7 @@ def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeyp
 
 
 def run_in_thread(action):
-    """Run where the lock of this thread is another's."""
+    """Run while another thread holds the lock."""
     import threading
 
     thread = threading.Thread(target=action)
@@ -318,7 +318,7 @@ def test_a_run_that_is_told_to_stop_saves_what_there_is(tmp_path, monkeypatch, c
     assert mapped(tmp_path / "m", "--checkpoint", "0") == 128 + stop
     assert signal.getsignal(stop) == before
     assert capsys.readouterr().err.endswith(
-        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, go on there with resume (--resume)\n"
+        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, continue with resume (--resume)\n"
         "stereovox: stopped\n"
     )
     assert load_map(tmp_path / "m").frames == 13

@@ -21,7 +21,7 @@ from stereovox.mapper import Mapper
 
 
 def write_recording(folder: Path, frames: int = 6) -> Path:
-    """A 7-Scenes folder: a camera that looks along z at a wall 2 m away with a box before it."""
+    """A 7-Scenes folder: a camera that faces along z a wall 2 m away with a box before it."""
     folder.mkdir()
     np.savetxt(folder / "camera-intrinsics.txt", [[60.0, 0, 39.5], [0, 60.0, 29.5], [0, 0, 1]])
     depth = np.full((60, 80), 2000, np.uint16)
@@ -180,15 +180,15 @@ MISTAKES = [
     ("is not a slice", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "1-5"]),
     ("selects none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
-    ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
+    ("no map to continue", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
     ("did you mean '--threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
     (
         "unknown option '--zebra' (known: --camera, --checkpoint, --close-loops, --device, --frames",
         ["map", "{rec}", "--out", "{tmp}/m", "--zebra"],
     ),
-    ("'extra' is one argument too many", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),
+    ("unexpected argument 'extra'", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),
     ("expected one argument", ["map", "{rec}", "--out"]),
-    ("'--jsn' stands before the command; write it after: stereovox info ... --jsn", ["--jsn", "info", "m"]),
+    ("'--jsn' is before the command; write it after: stereovox info ... --jsn", ["--jsn", "info", "m"]),
     ("expected one argument (write --up=-y)", ["picture", "{map}", "{tmp}/x.png", "--up", "-y"]),
     ("write --eye=-1,2,3", ["picture", "{map}", "{tmp}/x.png", "--eye", "-1,2,3"]),
     ("min_range 0.1 must be smaller than max_range 0.05", ["map", "{rec}", "--out", "{tmp}/m", "--max-range", "0.05"]),
@@ -430,7 +430,7 @@ def test_a_map_without_an_occupied_cell_asks_for_the_range(recording, tmp_path, 
     assert "note: no cell is occupied; is --max-range large enough?\n" in capsys.readouterr().err
     far = ["--set", "window.size=[4,4,4]", "--set", "window.centre=[90,0,0]"]
     assert run(*common[:2], "--out", tmp_path / "far", "--voxel-size", 0.1, *far) == 0
-    assert "the camera never was in the box" in capsys.readouterr().err
+    assert "the camera was never in the box" in capsys.readouterr().err
     unsure = ["--frames", ":1", "--set", "map.prior=0.001"]
     assert run(*common[:2], "--out", tmp_path / "unsure", "--voxel-size", 0.1, *unsure) == 0
     assert "are tentative; is --max-range large enough, map.prior too low?" in capsys.readouterr().err

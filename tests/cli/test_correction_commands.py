@@ -54,7 +54,7 @@ def test_remap(maps, tmp_path, told_with_notes, monkeypatch):
     assert "4 frames moved, by 0.40 m and 0.0 degrees (median), at most 0.40 m and 0.0 degrees" in said
     assert (result["repeated"], result["beyond"]) == (0, 1)
     assert "note: 1 poses are from before the first frame or after the last" in said
-    assert "far to turn" not in said
+    assert "a large rotation" not in said
     assert "4 frames have a pose" in said
     assert "stayed" not in said
 
@@ -62,11 +62,11 @@ def test_remap(maps, tmp_path, told_with_notes, monkeypatch):
 def test_remap_tells_of_frames_without_a_pose(maps, tmp_path, told_with_notes):
     result, said = told_with_notes("remap", maps / "a.svox", "--poses", maps / "two.tum", "--out", tmp_path / "n.svox")
     assert (result["posed"], result["between"], result["outside"]) == (2, 1, 1)
-    assert "1 frames before the first or after the last of them stayed where they were" in said
+    assert "1 frames before the first or after the last of them keep their poses" in said
 
 
 def test_remap_tells_of_lines_with_one_stamp_and_of_frames_that_turn_far(maps, tmp_path, told_with_notes):
-    """As where quaternions are written with w first."""
+    """As if quaternions were written with w first."""
     lines = [line.split() for line in (maps / "all.tum").read_text().splitlines()[1:]]
     turned = [[*line[:4], line[7], *line[4:7]] for line in lines]
     (tmp_path / "p.tum").write_text("\n".join(" ".join(line) for line in [*turned, *lines[:2]]))
@@ -76,7 +76,7 @@ def test_remap_tells_of_lines_with_one_stamp_and_of_frames_that_turn_far(maps, t
     assert result["repeated"] == 2
     assert "note: 2 lines of" in said
     assert result["turned_deg"]["median"] > 45
-    assert "note: that is far to turn" in said
+    assert "note: that is a large rotation" in said
 
 
 @pytest.mark.parametrize(("scale", "notes"), [(1000, 1), (1, 0)])
@@ -156,7 +156,7 @@ def test_loops_joins_a_second_odometry(tmp_path, told_with_notes, monkeypatch):
     result, said = told_with_notes("loops", "room.svox", "--odometry", "wheels.tum")
     assert result["odometry"]["used"] > 0
     assert result["odometry"]["contradicted"] == 0
-    assert f"had a part in {result['odometry']['used']} steps" in said
+    assert f"was used in {result['odometry']['used']} steps" in said
     write_trajectory(tmp_path / "later.tum", [10**15 + frame.stamp_ns for frame in frames], poses, "camera")
     assert main(["loops", "room.svox", "--odometry", "later.tum", "--out", "no.svox"]) == 2
     assert not (tmp_path / "no.svox").exists()

@@ -121,7 +121,7 @@ def test_mistakes_are_one_line(capsys, words, said):
 
 
 def test_a_path_of_another_world_gets_a_hint(folder, capsys):
-    hint = "the path does not fit the map: is it in the map's world frame?"
+    hint = "the path does not fit the map; is it in the map's world frame?"
     _, _, err = run(capsys, "map.svox", "truth.svox", "--path", "path.txt")
     assert hint not in err
     np.savetxt(folder / "path.txt", [[0.25, 0.25, 0.25 + 1.4 * CONFIG.max_range]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fleet's command: one line for a newcomer, its plan, and what it says of recordings that cannot be used."""
+"""The fleet's command: one line for a newcomer, its plan, and its report on unusable recordings."""
 
 import json
 
@@ -22,7 +22,7 @@ def test_two_recordings_one_line(tmp_path, capsys):
     assert main(["fleet", *recordings, "--out", str(out), *WORDS, "--json"]) == 3  # one is left out
     said = capsys.readouterr()
     result = json.loads(said.out.splitlines()[-1])
-    assert "left out: sim:nowhere: unknown scene" in said.out + said.err
+    assert "skipped: sim:nowhere: unknown scene" in said.out + said.err
     big = sv.load_map(out)
     assert result["boxes"] == result["boxes_mapped"] == len(big.manifest.boxes) > 0
     assert result["occupied"] == big.counts()["occupied"] > 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`stereovox eval`, `info` and `picture` with floors' maps in map_server files."""
+"""`stereovox eval`, `info` and `picture` with floor maps in map_server files."""
 
 import json
 
@@ -131,8 +131,8 @@ def test_the_map_s_own_picture_is_not_written_over(folder, capsys):
     [
         (["eval", "space.svox", "reference.yaml"], "stereovox export space.svox floor.yaml"),
         (["eval", "reference.yaml", "space.svox"], "space.svox: no floor's map"),
-        (["eval", "space.svox", "space.svox", "--no-align"], "--no-align: only for floors' maps"),
-        (["eval", "space.svox", "space.svox", "--exclude", "0,0,1,1"], "--exclude: only for floors' maps"),
+        (["eval", "space.svox", "space.svox", "--no-align"], "--no-align: only for floor maps"),
+        (["eval", "space.svox", "space.svox", "--exclude", "0,0,1,1"], "--exclude: only for floor maps"),
         (["eval", "half.yaml", "reference.yaml", "--exclude", "0,0,1"], "'0,0,1' is not a region"),
         (["eval", "half.yaml", "reference.yaml", "--exclude", "0,0,1,inf"], "'0,0,1,inf' is not a region"),
         (["eval", "half.yaml", "reference.yaml", "--path", "p.txt"], "--path"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""On a full disk commands say so, end with status 2, and leave what was there: here no file may grow beyond a limit."""
+"""On a full disk commands say so, end with status 2, and keep older files: here no file may grow beyond a limit."""
 
 from __future__ import annotations
 
@@ -73,4 +73,4 @@ def test_what_no_command_foresaw_is_told_with_the_cure(monkeypatch, capsys):
 
     monkeypatch.setattr("stereovox.cli.start.info.run", full)
     assert main(["info", "a.svox"]) == 2
-    assert "what was being written is not complete" in capsys.readouterr().err
+    assert "the file being written is incomplete" in capsys.readouterr().err

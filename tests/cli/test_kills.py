@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs that are killed while they write: what lies on the disk is a whole map, and the next run tidies up."""
+"""Runs that are killed while they write: the disk holds a whole map, and the next run tidies up."""
 
 import subprocess
 import sys

@@ -100,9 +100,9 @@ def test_rectangles_cover_just_the_chosen_cells():
         (["--view", "axes"], "did you mean 'axis'"),
         (["--view", "layer", "--at", "inf"], "layer at inf"),
         (["--view", "layer", "--up", "w"], "up 'w' is no axis"),
-        (["--at", "1"], "--at: the view 'overview' does not use it; it goes with: --view layer"),
+        (["--at", "1"], "--at: the view 'overview' does not use it; use it with: --view layer"),
         (["--view", "space", "--at", "1"], "--at: the view 'space' does not use it"),
-        (["--eye=1,2,3"], "--eye: the view 'overview' does not use it; it goes with: --view layer, --view axis, --vi"),
+        (["--eye=1,2,3"], "--eye: the view 'overview' does not use it; use it with: --view layer, --view axis, --vi"),
     ],
 )
 def test_mistakes_are_one_line(saved, tmp_path, capsys, words, said):

@@ -102,7 +102,7 @@ def test_mistakes_end_in_one_line(words, complaint, saved, tmp_path, monkeypatch
 
 
 def test_the_planner_keeps_its_distance(saved, tmp_path, monkeypatch, capsys):
-    """Every point of the way is farther than the radius from the nearest face of all cells that are not free."""
+    """Every point of the path is farther than the radius from the nearest face of any cell that is not free."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), saved, "0.55,0.55,0.65", "2.45,0.55,0.65"])
     plan = runpy.run_path(str(EXAMPLE), run_name="__main__")["plan"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`simulate`, `slam`, `localize`, `grid`, and `map` under a profile of two dimensions: a robot's bag becomes a map."""
+"""`simulate`, `slam`, `localize`, `grid`, and `map` under a 2-D profile: a robot's bag becomes a map."""
 
 import json
 from dataclasses import replace
@@ -174,7 +174,7 @@ def test_going_on_localises_in_the_map_and_takes_its_cells(bag, reference, tmp_p
     _, said = run(capsys, "grid", bag, "--resume", reference, "--start=0,0,0", "--out", out, "--profile", "ist2019")
     assert f"localising the robot in {reference}" in said
     assert read_map_server(out).resolution == read_map_server(reference).resolution
-    assert "SLAM makes a frame of its own" in refused(
+    assert "SLAM starts a new frame" in refused(
         capsys, "grid", bag, "--resume", reference, "--poses", "slam", "--out", out
     )
 
@@ -196,8 +196,8 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
     assert read_map_server(tmp_path / "floor.yaml").resolution == 0.02
     words = ("map", bag, "--profile", "ist2019", "--out")
     assert "ends in .yaml" in refused(capsys, *words, tmp_path / "floor.svox")
-    assert "--integrator: has no meaning" in refused(capsys, *words, tmp_path / "a.yaml", "--integrator", "ray")
-    assert "no map to go on with" in refused(capsys, *words, tmp_path / "a.yaml", "--resume")
+    assert "--integrator: does not apply" in refused(capsys, *words, tmp_path / "a.yaml", "--integrator", "ray")
+    assert "no map to continue" in refused(capsys, *words, tmp_path / "a.yaml", "--resume")
     run(capsys, "map", bag, "--set", "dimensions=2", "--out", tmp_path / "b.yaml", "--frames", "::8")
 
 
@@ -211,7 +211,7 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
         (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "selects none"),
         (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'grid.thickness'"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum"), "nowhere.yaml"),
-        (("grid", DRIVE, "--out", "a.yaml", "--poses", "odometry", "--start", "0,0,0"), "says where in a map"),
+        (("grid", DRIVE, "--out", "a.yaml", "--poses", "odometry", "--start", "0,0,0"), "is a pose in a map"),
         (("grid", DRIVE, "--out", "a.pgm", "--mode", "scale"), "mode scale has no grey for unknown cells"),
         (("map", "sim:room", "--out", "a.yaml"), "names a floor's map"),
         (("map", "sim:room", "--out", "a.svox", "--rerun", "notes.txt"), "end the file's name with .rrd"),

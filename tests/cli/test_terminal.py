@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words about times: of a warm run, or saying that they are not."""
+"""Remarks on times: of a warm run, or of a run that compiles."""
 
 from types import SimpleNamespace
 

@@ -27,7 +27,7 @@ def test_track_writes_poses_and_says_how_it_went(here, capsys):
     found = json.loads(out.splitlines()[-1])
     assert (status, found["frames"], found["tracked"], found["lost"]) == (0, 6, 6, [])
     assert set(found["frame_ms"]) == {"median", "p90", "p99", "max"}
-    assert "6 of 6 frames tracked, a way of 0.2" in err
+    assert "6 of 6 frames tracked over 0.2" in err
     assert "saved in way.tum; make a map with these poses: stereovox map desk --poses track" in err
     assert len((here / "way.tum").read_text().splitlines()) == 7
 
@@ -90,13 +90,13 @@ def test_map_says_which_poses_it_uses(here, capsys):
     status, out, err = run(capsys, "map", "desk", "--json")
     found = json.loads(out.splitlines()[-1])
     assert (status, found["poses"], found["frames"], found["refused"]) == (0, "track", 4, {"tracking_lost": 2})
-    assert "note: the camera is tracked by its own images, without poses (desk: has depth images (6)" in err
+    assert "note: the camera is tracked by visual odometry, since poses are missing (desk: has depth images (6)" in err
     assert "poses: tracked, 4 of 6 frames\n  lost from frame 4 to 5 (0.0 s): " in err
     unposed(here / "posed", 6, poses=True)
     status, out, err = run(capsys, "map", "posed", "--json")
     found = json.loads(out.splitlines()[-1])
     assert (status, found["poses"], "lost" in found) == (0, "given", False)
-    assert "poses: those of the recording" in err
+    assert "poses: from the recording" in err
     status, _, err = run(capsys, "map", "posed", "--out", "again.svox", "--poses", "track")
     assert (status, "poses: tracked, 6 of 6 frames" in err) == (0, True)
 

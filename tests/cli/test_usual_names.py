@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`stereovox map` and `picture` without a name to write to: the usual one, which never replaces anything."""
+"""`stereovox map` and `picture` without an output name: the default one, which never replaces anything."""
 
 import pytest
 
@@ -20,7 +20,7 @@ def test_a_map_and_its_picture_name_themselves(tmp_path, monkeypatch, capsys):
     before = (tmp_path / "room.png").read_bytes()
     capsys.readouterr()
     assert main(["map", *COARSE, "--set", "up=x"]) == 2
-    assert "room.svox: is here already; replace it with --out room.svox" in capsys.readouterr().err
+    assert "room.svox: already exists; replace it with --out room.svox" in capsys.readouterr().err
     assert load_map("room.svox").config.up == "z"
     assert main(["picture", "room.svox"]) == 2
     assert "replace it with: stereovox picture room.svox room.png" in capsys.readouterr().err
@@ -33,7 +33,7 @@ def test_the_map_of_a_floor_has_its_ending(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "floor.yaml").touch()
     assert main(["map", "sim:floor", "--profile", "ist2019"]) == 2
-    assert "floor.yaml: is here already" in capsys.readouterr().err
+    assert "floor.yaml: already exists" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`stereovox view` as a user runs it: it says where the page is, serves it, and ends at Ctrl-C."""
+"""`stereovox view` as a user runs it: it prints the link, serves the page, and ends at Ctrl-C."""
 
 import json
 import signal
@@ -96,7 +96,7 @@ def status_of(link):
 
 def test_a_page_for_others_needs_the_link_that_is_printed(saved, start):
     running = start("view", saved, "--port", 0, "--host", "0.0.0.0")
-    assert "whoever has this link" in running.stderr.readline()
+    assert "anyone with this link" in running.stderr.readline()
     link = next(word for word in running.stderr.readline().split() if word.startswith("http://localhost:"))
     place, token = link.split("/?token=")
     assert (status_of(link), status_of(place), status_of(f"{place}/?token={token[:-1]}")) == (200, 403, 403)
@@ -132,7 +132,7 @@ def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys,
 
     monkeypatch.setattr(viewer.Viewer, "wait", lambda self: None)
     assert main(["view", str(saved), "--port", "0", "--token", "a" * 16]) == 0
-    assert "whoever has this link can look at the map\n" in capsys.readouterr().err
+    assert "anyone with this link can view the map\n" in capsys.readouterr().err
 
 
 def test_a_recording_adds_a_timeline(saved, tmp_path, capsys, monkeypatch):
@@ -152,7 +152,7 @@ def test_a_recording_adds_a_timeline(saved, tmp_path, capsys, monkeypatch):
     assert ["Recording" in labels for labels in said] == [True, False]
     assert main(["view", str(saved), "--port", "0", "--recording", str(tmp_path / "nothing")]) == 2
     assert main(["view", str(saved), "--port", "0", "--frames", ":3"]) == 2
-    assert "--frames: picks frames of --recording" in capsys.readouterr().err
+    assert "--frames: selects frames of --recording" in capsys.readouterr().err
 
 
 def test_map_shows_the_map_while_it_grows(tmp_path, start):

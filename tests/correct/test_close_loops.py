@@ -165,7 +165,7 @@ def test_that_places_alike_may_be_mistaken_is_said_where_poses_were_far_off(clos
     (loop, *_) = closure.loops
     for off_m, said in ((1.0, False), (4.0, True)):
         say_closure(replace(closure, loops=[replace(loop, off_m=off_m)]))
-        assert ("may be taken for one another" in "".join(capsys.readouterr())) == said
+        assert ("may have been confused" in "".join(capsys.readouterr())) == said
 
 
 def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tmp_path):

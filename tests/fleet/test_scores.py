@@ -134,7 +134,7 @@ def test_what_cannot_be_scored_is_told_and_left_out(sequences, tmp_path, capsys)
     words = [sequences[0], "sim:box?image_width=64", "--out", str(out), "--voxel-size", "0.5", "--workers", "1"]
     assert main(["score", *words, "--json"]) == 3
     said = capsys.readouterr()
-    assert "left out: sim:box?image_width=64: " in said.out + said.err
+    assert "skipped: sim:box?image_width=64: " in said.out + said.err
     table = json.loads(said.out.splitlines()[-1])["table"]
     assert [row["recording"] for row in table] == [sequences[0], "all"]
     assert "0000  " in said.err + said.out  # names are short where that tells them apart

@@ -81,6 +81,6 @@ def test_a_floor_is_not_copied_onto_itself(tmp_path, capsys):
     write_map_server(floor(), tmp_path / "in.yaml")
     before = (tmp_path / "in.pgm").read_bytes()
     assert main(["import", str(tmp_path / "in.yaml"), str(tmp_path / "in.pgm")]) == 2
-    assert "would overwrite what it is made of" in capsys.readouterr().err
+    assert "would overwrite its own input" in capsys.readouterr().err
     assert (tmp_path / "in.pgm").read_bytes() == before
     assert main(["import", str(tmp_path / "in.pgm"), str(tmp_path / "m.svox"), "--heights", "0:1"]) == 0

@@ -150,7 +150,7 @@ def test_a_late_camera_is_stale_although_it_never_falls_silent():
         mapper.add(frame(stamp_ns=time() - 3 * S))
     health = mapper.health()
     assert (health.state, health.age_s) == ("stale", pytest.approx(3.0))
-    assert health.text == "stale: last trusted frame 3.00 s ago; frames of 'camera' come 3.00 s late"
+    assert health.text == "stale: last trusted frame 3.00 s ago; frames of 'camera' arrive 3.00 s late"
     time.s += 2.5
     assert mapper.health().state == "lost"
 

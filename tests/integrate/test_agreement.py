@@ -1,4 +1,4 @@
-"""Projective maps against maps of exact rays with one update a cell a frame."""
+"""Projective maps against maps of exact rays with one update per cell and frame."""
 
 from functools import cache
 from pathlib import Path
@@ -29,7 +29,7 @@ def map_of(name, voxel_size, settings):
 
 
 def shares_of(name, voxel_size, **settings):
-    """Agreement of a projective map with that of exact rays, which is made once for all projective ones."""
+    """Agreement of a projective map with the map of exact rays, which is made once for all."""
     of_both = {key: value for key, value in settings.items() if not key.startswith("projective.")}
     rays = tuple({**of_both, "integrator": "ray", "ray.update": "once"}.items())
     return agreement(map_of(name, voxel_size, tuple(settings.items())), map_of(name, voxel_size, rays))

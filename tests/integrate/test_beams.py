@@ -25,7 +25,7 @@ def config_of(traversal="exact", update="once", **settings):
 
 
 def made_scan(seed=0, pose=(0.013, -0.021, 0.3), beams=60, **changes):
-    """A scan of 4.2 radians with all that a beam can be."""
+    """A scan of 4.2 radians with all kinds of beams."""
     rng = np.random.default_rng(seed)
     ranges = rng.uniform(0.05, 3.5, beams).astype(np.float32)
     strange = rng.random(beams) < 0.3
@@ -88,7 +88,7 @@ def test_any_scan_equals_the_reference(traversal, update, numbers, pose):
 @pytest.mark.parametrize("traversal", ["exact", "bresenham"])
 @pytest.mark.parametrize("name", ["mirrored", "turned", "moved"])
 def test_evidence_moves_with_the_world(traversal, name):
-    """Mirrored, by a quarter turn, and by whole cells, so that edges of tiles lie elsewhere."""
+    """Mirrored, by a quarter turn, and by whole cells, so that edges of tiles are elsewhere."""
     config = config_of(traversal, "every", voxel_size=0.125)
     rng = np.random.default_rng(3)
     scan = Scan(rng.uniform(0.3, 2.9, 90).astype(np.float32), -2.0, 0.045, 0.1, 5.0, se2.lifted([0.037, 0.061, 0]))

@@ -22,7 +22,7 @@ PIXEL = {"width": 1, "height": 1, "cx": 0.0, "cy": 0.0}
 
 
 def frame_of(camera, far=True, **more):
-    """An image that sees nothing up to the maximum range, which clears all there is, or a wall."""
+    """An image that sees nothing up to the maximum range, and so clears everything, or a wall."""
     shape = camera.height, camera.width
     reason = np.full(shape, Reason.TOO_FAR if far else Reason.VALID, np.uint8)
     return sv.Frame(np.full(shape, 0.0 if far else 2.0, np.float32), camera, np.eye(4), reason=reason, **more)
@@ -121,7 +121,7 @@ def test_noise_that_reaches_farther_than_can_be_counted():
 
 
 def test_a_steep_camera_under_a_deadline_never_raises():
-    """Blocks of its pixels are steeper than any pinhole: the coarse way has to refuse what the full one takes."""
+    """Blocks of its pixels are steeper than any pinhole: the coarse level must refuse what the full one accepts."""
     camera = sv.PinholeCamera(1, 1, 0.05, 0.05, 0.0, 0.0)
     mapper = sv.Mapper(voxel_size=0.5, deadline_ms=1e-6)
     reports = [mapper.add(frame_of(camera, far=False, stamp_ns=n)) for n in range(12)]

@@ -12,7 +12,7 @@ from stereovox.integrate.crossing import crossed_cells, scan_evidence
 
 
 def slowly_crossed(start: np.ndarray, stop: np.ndarray) -> set[tuple[int, ...]]:
-    """Cells of size 1 in which the ray has a piece: between any two of its crossings, look at the middle."""
+    """Cells of size 1 that contain a piece of the ray: check the middle between any two of its crossings."""
     at = [0.0, 1.0]
     for axis in range(3):
         low, high = sorted((start[axis], stop[axis]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pinhole images that wide images are cut into: all that is seen, no finer and no more than the image needs."""
+"""The pinhole images of wide images: they show everything seen, no finer and no more than the image needs."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ KINDS = st.sampled_from([SphericalCamera, CylindricalCamera])
 
 
 def whole_faces(camera):
-    """The six sides of the cube without any cutting: for each the seen pixels' places, and what they are of."""
+    """The six uncut sides of the cube: for each the positions of its seen pixels, and their source pixels."""
     size = max(2, round(2 * max(camera.focal_px / camera.binning, 1 / camera.step_v)))
     middle = (size - 1) / 2
     pinhole = PinholeCamera(size, size, size / 2, size / 2, middle, middle)

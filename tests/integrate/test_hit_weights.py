@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a hit counts: in full where much of a cell's footprint says so, less where only a few pixels do."""
+"""The weight of a hit: full if much of a cell's footprint supports it, less if only a few pixels do."""
 
 import naive_integrators
 import numpy as np
@@ -98,7 +98,7 @@ def test_a_lone_wrong_pixel_is_less_than_a_surface_in_every_large_cell(model):
 
 
 def test_a_single_pixel_is_all_that_a_small_cell_has():
-    """Where a cell is no larger than a pixel, one pixel is its whole footprint."""
+    """If a cell is no larger than a pixel, one pixel is its whole footprint."""
     config = load_config(voxel_size=0.02, max_range=3.5, **{"sensor.model": "constant"})
     assert set(hits_of(wall_with((30, 40)), make_integrator(config)).values()) == {847}
 

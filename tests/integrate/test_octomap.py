@@ -75,7 +75,7 @@ def state(log_odds):
 
 
 def differences(ours, theirs):
-    """Count cells by (our state, their state) where these differ."""
+    """Count the cells that differ by (our state, their state)."""
     pairs = ((state(ours.get(cell)), state(theirs.get(cell))) for cell in ours.keys() | theirs.keys())
     return Counter(pair for pair in pairs if pair[0] != pair[1])
 

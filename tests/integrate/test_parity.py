@@ -70,7 +70,7 @@ def test_lone_far_pixels_mark_and_clear_as_in_the_reference(model):
 
 
 class Late:
-    """Made up: clears up to two sigma behind what was measured, and marks behind that where `marks`."""
+    """Made up: clears up to two sigma behind a measurement, and marks beyond that if `marks`."""
 
     p_free, p_unknown = 0.3, 0.5
 
@@ -87,7 +87,7 @@ class Late:
 
 
 class Tail(Late):
-    """Made up: still says a little four sigma behind what was measured, where the table ends."""
+    """Made up: still gives a little evidence four sigma behind a measurement, at the end of the table."""
 
     def probability(self, z, z_measured, sigma):
         t = (z - z_measured) / sigma
@@ -129,7 +129,7 @@ def test_ray_and_line_equal_their_references(integrator, model, voxel_size, upda
 @pytest.mark.parametrize("camera", WIDE)
 @pytest.mark.parametrize("integrator", ["ray", "line"])
 def test_rays_of_wide_cameras_equal_their_references(integrator, camera, model, update):
-    """Depth is the distance from the x axis, and rays may look sideways and back."""
+    """Depth is the distance from the x axis, and rays may point sideways and back."""
     settings = {"sensor.model": model, "ray.update": update, "noise.s2": 0.01}
     config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **settings)
     image = made_image(5, WIDE[camera])
@@ -139,7 +139,7 @@ def test_rays_of_wide_cameras_equal_their_references(integrator, camera, model, 
 @pytest.mark.parametrize("update", ["once", "every"])
 @pytest.mark.parametrize("integrator", ["ray", "line"])
 def test_rays_of_a_row_may_part_along_every_axis(integrator, update):
-    """A camera that looks along an axis: rays of one row go to both sides of it."""
+    """A camera that faces along an axis: rays of one row go to both sides of it."""
     config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **{"ray.update": update})
     image = made_image(6, replace(CAMERA, cx=19.3))
     pose = np.eye(4)
@@ -200,7 +200,7 @@ def test_threads_change_nothing(integrator, model, monkeypatch):
 
 @pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 def test_far_from_the_origin_nothing_changes(integrator):
-    """Cells are counted from the camera's block, so float32 is as good at 100 km as at home."""
+    """Cells are counted from the camera's block, so float32 is as good at 100 km as at the origin."""
     config = load_config(voxel_size=0.125, integrator=integrator, **{"ray.update": "once"})
     image = made_image(1)
     blocks = np.array([800_000, -700_000, 3])

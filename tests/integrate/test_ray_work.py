@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rays of a frame are bounded by the deadline, followed in parts, and told where that is slow."""
+"""The rays of a frame are bounded by the deadline, followed in parts, and reported if that is slow."""
 
 import warnings
 

@@ -74,7 +74,7 @@ def test_cells_and_pixels_are_computed_in_whole_vectors(made, processor, kernel,
 
 @pytest.mark.parametrize("processor", [ZEN_3, SKYLAKE_512], ids=lambda processor: processor.cpu)
 def test_denoising_averages_in_whole_vectors(made, processor):
-    """Not on AArch64, where LLVM thinks that the two divisions cost more together than one by one."""
+    """Not on AArch64, for which LLVM judges the two divisions cheaper one by one."""
     widest = max(loops_of(made[processor][DENOISE], 20), key=lambda one: one.wide_products)
     assert widest.lanes == LANES[processor]
     assert widest.wide_divisions >= 2

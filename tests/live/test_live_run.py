@@ -213,7 +213,7 @@ def test_a_camera_whose_clock_is_set_back_is_never_mapped_at_an_old_pose(tmp_pat
 
 
 def test_no_pose_at_all_is_an_error_and_no_map(tmp_path):
-    with pytest.raises(StereovoxError, match=r"written \(3 images came, but no pose: the tracker\)"):
+    with pytest.raises(StereovoxError, match=r"written \(3 images arrived, but no pose: the tracker\)"):
         map_live(Images(count=3), tmp_path / "a.svox", poses=LivePoses("the tracker"), wait_s=0.01, **SMALL)
     assert not (tmp_path / "a.svox").exists()
 
@@ -242,7 +242,7 @@ def test_a_camera_that_fails_does_not_end_the_others(tmp_path):
             [LiveCamera(bad), LiveCamera(Images("good", 20))], tmp_path / "a.svox", poses=poses, notify=said.append,
             **SMALL,
         )  # fmt: skip
-    assert "bad: no frame for 5 s; check cable; the other cameras go on" in said
+    assert "bad: no frame for 5 s; check cable; the other cameras continue" in said
     assert done.live["cameras"]["bad"]["failure"].startswith("bad: no frame")
     assert done.live["cameras"]["good"]["received"] == 20
 
@@ -253,7 +253,7 @@ def test_each_camera_that_fails_is_told_once(tmp_path):
     with Sender(poses.add):
         map_live([*cameras, Images("c", 25)], tmp_path / "a.svox", poses=poses, notify=said.append, **SMALL)
     told = [line for line in said if "gone" in line]
-    assert told == ["b: gone; the other cameras go on", "a: gone; the other cameras go on"]
+    assert told == ["b: gone; the other cameras continue", "a: gone; the other cameras continue"]
 
 
 def test_a_camera_that_goes_silent_is_told(tmp_path, monkeypatch):
@@ -268,12 +268,12 @@ def test_a_camera_that_goes_silent_is_told(tmp_path, monkeypatch):
 
     def notify(line):
         said.append(line)
-        if "no image has come" in line:
+        if "no image has arrived" in line:
             told.set()
 
     with Sender(poses.add):
         done = map_live(Silent("front", 5), tmp_path / "a.svox", poses=poses, notify=notify, **SMALL)
-    assert "front: no image has come for 0.3 s; is it still connected?" in said
+    assert "front: no image has arrived for 0.3 s; is it still connected?" in said
     assert done.live["cameras"]["front"]["received"] == 5
 
 
@@ -289,7 +289,7 @@ def test_the_last_camera_that_fails_ends_the_run_and_the_map_is_saved(tmp_path):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("poses", [GIVEN, TRACK])
 def test_a_library_that_ends_a_cameras_thread_ends_the_run(tmp_path, poses):
-    """Else the run would wait for images for ever."""
+    """Otherwise the run would wait for images for ever."""
     with pytest.raises(StereovoxError, match="not one"):
         map_live(Images(count=2, failure=SystemExit(3)), tmp_path / "a.svox", poses=poses, **SMALL)
 
@@ -318,7 +318,7 @@ def test_signals_act_while_no_image_comes(tmp_path, obeys_signals):
 
 
 def test_a_replayed_simulation_is_its_offline_map(tmp_path):
-    """With a 2-D map, the distances all round and a recording at once, all of the same map."""
+    """With a 2-D map, distances in all directions and a recording at once, all of the same map."""
     name = "sim:room?frames=12&image_width=160"
     keeper = Keeper()
     outputs = {"grid": tmp_path / "g.yaml", "sphere": tmp_path / "s.png", "record": tmp_path / "log.mcap"}
@@ -364,7 +364,7 @@ def test_the_distances_all_round_are_those_of_all_cameras(tmp_path):
 
 
 def test_a_tracked_camera_moves_the_others(tmp_path, monkeypatch):
-    """The second camera has no poses: it looks back from a mount, and sees its wall behind."""
+    """The second camera has no poses: it faces back from a mount, and sees its wall behind."""
     monkeypatch.setattr("stereovox.live.stream.UNTRACKED", 40)  # a busy machine drops none
     monkeypatch.setattr("stereovox.live.stream.LATE_S", 40.0)
     tracking = threading.Event()
@@ -412,7 +412,7 @@ def test_a_tracked_map_cannot_be_resumed(tmp_path):
     poses = LivePoses()
     with Sender(poses.add):
         map_live(Images(), tmp_path / "a.svox", poses=poses, **SMALL)
-    with pytest.raises(StereovoxError, match="does not know where in it it is"):
+    with pytest.raises(StereovoxError, match="cannot be located in a saved map"):
         map_live(Images(), tmp_path / "a.svox", poses=TRACK, resume=True)
 
 
@@ -438,7 +438,7 @@ def test_the_command_maps_a_file_of_cameras_and_says_what_became_of_them(tmp_pat
     assert result["live"]["cameras"]["also"] == {"received": 6, "dropped": 0, "before_first_pose": 0}
     assert set(result["live"]["latency_ms"]["map"]) == {"median", "p90", "p99", "max"}
     assert "in a browser to see the map grow" in err
-    assert "front: 6 images came, 0 dropped" in err
+    assert "front: 6 images received, 0 dropped" in err
 
 
 def test_a_recording_whose_pose_files_are_all_missing_is_tracked(tmp_path):
@@ -473,7 +473,7 @@ def _full(*_, **__):
 
 @pytest.mark.parametrize("step", ["write", "fsync", "replace"])
 def test_what_a_full_disk_kept_from_being_written_is_told_and_the_map_is_kept(step, tmp_path, capsys, monkeypatch):
-    """The disk of the outputs is full, that of the map is not."""
+    """The disk of the outputs is full, but not the disk of the map."""
     other = tmp_path / "full"
     other.mkdir()
     if step == "write":
@@ -501,7 +501,7 @@ def test_what_a_full_disk_kept_from_being_written_is_told_and_the_map_is_kept(st
         assert len(failed) == 1, name
         assert f"not written: {failed[0]}" in err
     assert "recorded in" not in err
-    assert "distances all round: " not in err
+    assert "distances in all directions: " not in err
 
 
 @pytest.mark.parametrize(

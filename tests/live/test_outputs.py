@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outputs of a growing map: files of the 2-D map that are written anew, recordings that do not hold the map up."""
+"""Outputs of a growing map: files of the 2-D map that are rewritten, recordings that do not delay the map."""
 
 import json
 import sys
@@ -115,7 +115,7 @@ def test_a_full_disk_ends_the_recording_alone(error, why, tmp_path, monkeypatch)
     for k in range(3):
         recorder.after(frame(k), UpdateReport())
     recorder.close()
-    assert said == [f"{why}; nothing is recorded, mapping goes on"]
+    assert said == [f"{why}; nothing is recorded; mapping continues"]
     assert not list(tmp_path.iterdir())
 
 
@@ -137,8 +137,8 @@ def test_what_was_recorded_before_the_disk_was_full_is_kept(tmp_path, monkeypatc
     recorder.close()
     (left,) = tmp_path.glob("log.mcap.*.unfinished/log/log.mcap")
     assert said == [
-        f"log.mcap: cannot be written (No space left on device); what was recorded before is in "
-        f"{left.relative_to(tmp_path)}, mapping goes on"
+        f"log.mcap: cannot be written (No space left on device); the part recorded before is in "
+        f"{left.relative_to(tmp_path)}; mapping continues"
     ]
     assert 10 < len(open_source(left)) <= 20  # the last megabyte may be missing
 
@@ -250,7 +250,7 @@ def test_names_become_topics(name, word):
 
 
 def test_two_cameras_of_one_topic_are_refused(tmp_path):
-    with pytest.raises(StereovoxError, match="have one topic"):
+    with pytest.raises(StereovoxError, match="share a topic"):
         Recorder(tmp_path / "log.mcap", {"a b": T_BODY_OPTICAL, "a:b": T_BODY_OPTICAL})
 
 

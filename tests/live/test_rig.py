@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mounts and clocks of several cameras, and the file that says them."""
+"""Mounts and clocks of several cameras, and the file that gives them."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_a_file_of_two_cameras(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no camera; write a table"),
+        ("", "holds no camera; write one table"),
         ("[camera]\nsource = 'a'", "holds no camera"),
         ("[[camera]]\nname = 'a'", "camera 1: source is missing"),
         ("[[camera]]\nsource = 3", "camera 1: source = 3 must be a text"),

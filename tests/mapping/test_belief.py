@@ -24,12 +24,12 @@ RESTLESS = WORLD._replace(votes=Votes(world=20, neither=60))
 BEHIND = STILL._replace(behind=200)
 ELSEWHERE = WORLD._replace(anchored=0.4)
 MOVED_SIGHT = WORLD._replace(fault="moved")
-SCALED = WORLD._replace(fault="its depths x 1.2")
+SCALED = WORLD._replace(fault="seen with depths x 1.2")
 AGREES = WORLD._replace(anchored=0.97)
 
 
 class Told:
-    """A monitor that is asked frame by frame; its history goes through a file before each of them."""
+    """A monitor that judges frame by frame; its history is saved and loaded before each frame."""
 
     def __init__(self, sight=WORLD, **trust):
         self.config = load_config(voxel_size=0.1, **{f"trust.{name}": value for name, value in trust.items()})
@@ -240,7 +240,7 @@ def test_each_sensor_is_for_itself_and_there_are_so_many():
 
 
 def test_a_doubt_ends_where_the_gate_lets_a_sensor_begin_anew():
-    """A map that is gone on with elsewhere, or later, must not refuse what it has never seen."""
+    """A map that is continued elsewhere, or later, must not refuse unknown space."""
     mapper = sv.Mapper(voxel_size=0.1, **{"trust.settle_s": 0.5})
     frames = list(sv.open_source("sim:room?image_width=160", frames=":30"))
     for frame in frames:

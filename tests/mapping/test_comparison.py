@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera would have to stand for its image to lie on the surfaces of a map."""
+"""The pose at which a camera's image would be on the surfaces of a map."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def test_images_of_few_rows_are_looked_for_as_well(room, height):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("far_m", [1e9, 1e150])
 def test_points_beyond_the_map_do_not_count(far_m):
-    """A lidar may give any number, and so many that they have normals; a frame in doubt is compared with the map."""
+    """A lidar may return any range, in enough points to have normals; a frame in doubt is compared with the map."""
     lean = np.random.default_rng(1).uniform(-1, 1, (400, 2))
     far = far_m * np.column_stack([np.ones(400), lean])
     found = []
@@ -75,7 +75,7 @@ def test_points_beyond_the_map_do_not_count(far_m):
 
 
 def test_a_saved_map_holds_no_cells_that_cannot_be_read(tmp_path):
-    """Poses so far away that cell numbers come to an end are refused before, whatever the cells' sides."""
+    """Poses beyond the range of cell numbers are refused earlier, whatever the cells' sides."""
     rng = np.random.default_rng(2)
     for steps in ((0.002, 0.002, 0.0005), (0.004, 0.001, 0.001)):
         mapper = sv.Mapper(steps=steps, max_range=1.0, **{"trust.max_speed_mps": 1e12, "trust.ordered": False})

@@ -18,7 +18,7 @@ DEADLINE = 20.0
 
 
 def run(frames, costs, on=None):
-    """Return the step of each of so many frames, -1 for those left out, where way k takes `costs[k]` milliseconds."""
+    """Return the level of each frame, -1 for skipped ones, if level k takes `costs[k]` milliseconds."""
     on, steps = on or Scheduler(len(costs), DEADLINE), []
     for _ in range(frames):
         out = on.skips()
@@ -127,7 +127,7 @@ def test_whatever_frames_take_it_never_goes_to_and_fro(times):
 
 
 def stage(*things):
-    """Return a frame of a camera at the origin that looks along x at a wall 4 m away and at `things`."""
+    """Return a frame of a camera at the origin that faces along x a wall 4 m away and `things`."""
     camera = sv.PinholeCamera.from_field_of_view(120, 90, 70, 0.05)
     scene = Scene([box("wall", "wall", (4, -6, -4), (4.2, 6, 4)), *things])
     pose = np.array([[0, 0, 1, 0.013], [-1, 0, 0, 0.021], [0, -1, 0, 0.007], [0, 0, 0, 1.0]])
@@ -138,7 +138,7 @@ def stage(*things):
 
 
 def said(way, frame):
-    """Return {block: (512,) evidence} of a frame on one way."""
+    """Return {block: (512,) evidence} of a frame at one level."""
     evidence = way.integrator.evidence(way.depth.image(way.depth.matched(frame)))
     found = {tuple(c): v.astype(int) for c, v in zip(evidence.coords.tolist(), evidence.values.copy(), strict=True)}
     return {
@@ -149,7 +149,7 @@ def said(way, frame):
 
 @pytest.mark.parametrize("integrator", ["projective", "ray"])
 def test_near_says_of_what_is_near_what_full_says_and_of_the_rest_nothing(integrator):
-    """Also of things that stand right at its limit, 2.5 m, where a camera that sees less far would clear them."""
+    """Also for things exactly at its limit, 2.5 m, at which a camera of shorter range would clear them."""
     things = [box("post", f"post {x}", (x, y, -1), (x + 0.03, y + 0.03, 1)) for x, y in ((1.5, 0.5), (2.48, 0.0))]
     things += [box("wall", "at the limit", (2.52, -1.2, -1), (2.7, -0.6, 1))]
     frame = stage(*things)
@@ -184,7 +184,7 @@ def test_pairs_are_matched_at_half_the_resolution_on_the_coarse_way():
 
 
 class Clock:
-    """Stands for the clock of a mapper; each look at it takes half of a frame."""
+    """A mapper's clock; each reading takes half of a frame."""
 
     def __init__(self, monkeypatch):
         self.now, self.frame_ms = 0.0, 0.0

@@ -27,7 +27,7 @@ CELLS = [
 
 
 def complaints(check: Check, number: int, kind: str, monkeypatch) -> list[str]:
-    """Offer the bad inputs of a cell; return what did not go as it must."""
+    """Offer the bad inputs of a cell; return all deviations."""
     found = []
     for case in cases(check.reason, number, kind):
         with monkeypatch.context() as patch:
@@ -107,7 +107,7 @@ def test_a_bad_input_is_refused(check, number, kind, monkeypatch):
 
 @pytest.mark.parametrize(("check", "number", "kind"), CELLS)
 def test_a_check_that_is_taken_away_is_missed(check, number, kind, monkeypatch):
-    """So the function in the cell is the one that refuses, and the test above would see that it is gone."""
+    """So the function in the cell is the one that refuses, and the test above would notice its absence."""
     for function in functions(check.cells[kind]):
         function = inspect.unwrap(function)  # without the lock around it
         monkeypatch.setattr(function, "__code__", taken_away(function, check.reason))
@@ -170,7 +170,7 @@ def test_no_door_is_beside_the_entrance():
 
 
 def refusals():
-    """Return the reasons of all refusals in the sources, and where they are."""
+    """Return the reasons of all refusals in the sources, and their places."""
     word = re.compile(r'(?:FrameRefused\(\s*|\bfault=)"([^"]+)"')
     return {(found, name) for name, text in sources().items() for found in word.findall(text)}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans are compared with the grid: what beams say of it against plain Python, bad scans, and floors that change."""
+"""Scans are compared with the grid: beams against plain Python, bad scans, and floors that change."""
 
 from dataclasses import replace
 from math import floor, inf, isnan
@@ -47,7 +47,7 @@ def made(cell="int16", seed=0, size=60):
 
 
 class Slow:
-    """What the kernels say, cell by cell, from the log-odds and the settings alone."""
+    """The result of the kernels, cell by cell, from the log-odds and the settings alone."""
 
     def __init__(self, made_map, table):
         self.table = table
@@ -214,7 +214,7 @@ def hall(people=()):
 
 
 def scan_at(n, outline, x, y, yaw, sensor=""):
-    """The n-th scan, 10 a second: 360 beams round a lidar."""
+    """The n-th scan, 10 per second: 360 beams around a lidar."""
     angles = np.radians(np.arange(360.0))
     ranges = cast(outline, (x, y), yaw + angles) + np.random.default_rng(n).normal(0, 0.01, 360)
     T = se2.lifted([x, y, yaw])
@@ -287,7 +287,7 @@ def test_sensors_at_different_heights_see_different_obstacles():
 
 
 def test_what_drew_a_picture_is_not_known(ground):
-    """Images see tables that the lidar of a map server's picture looked under; a lidar is compared with it."""
+    """Images see tables that the lidar of a map server's picture missed; a lidar is compared with it."""
     image = next(iter(open_robot("sim:floor?plan=testbed&seconds=2&image_width=160").frames))
     cells = np.where(np.random.default_rng(0).random((400, 400)) < 0.001, 100, 0).astype(np.int8)
     full = OccupancyGrid(cells, 0.05, (-10.0, -10.0, 0.0))

@@ -124,7 +124,7 @@ def test_a_frozen_camera_frees_hardly_anything_in_a_young_map():
         points = points[mapper.map.state(points) == sv.State.OCCUPIED]
         reports = [mapper.add(freeze(frame, still, random)) for frame in frames[30:]]
         freed.append((mapper.map.state(points) == sv.State.FREE).sum())
-    assert not any("seen from elsewhere" in report.detail for report in reports)  # the last mapper's
+    assert not any("a view from elsewhere" in report.detail for report in reports)  # the last mapper's
     assert freed[0] < 0.25 * freed[1]
 
 
@@ -135,6 +135,6 @@ def test_a_frozen_camera_is_refused_with_its_cure_and_good_frames_follow():
         mapper.add(frame)
     report = mapper.add(freeze(frames[34], metres(frames[30]), np.random.default_rng(1)))
     assert report.refused == "frozen_image"
-    assert report.detail.startswith(f"{frames[34].name}: it shows what was seen from elsewhere (")
+    assert report.detail.startswith(f"{frames[34].name}: it repeats a view from elsewhere (")
     assert report.detail.endswith("restart the sensor")
     assert mapper.add(frames[34]).refused is None

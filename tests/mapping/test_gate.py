@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames fit to those before them: each reason, what settles, and that what is refused changes nothing."""
+"""Which frames fit the earlier ones: each reason, reacceptance, and that refusals change nothing."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ FRAME_MS = 33
 
 
 def frame_at(ms, x=0.0, yaw_deg=0.0, **changes):
-    """A wall two metres before a camera at (x, 0, 0) that looks along x, turned to the left."""
+    """A wall two metres before a camera at (x, 0, 0) that faces along x, turned to the left."""
     T = AHEAD.copy()
     T[:3, :3] = rotation_matrix([0, 0, np.radians(yaw_deg)]) @ T[:3, :3]
     T[0, 3] = x
@@ -31,7 +31,7 @@ def frame_at(ms, x=0.0, yaw_deg=0.0, **changes):
 
 
 def verdicts(frames, **trust):
-    """Return why each frame was refused, or what it was believed again after, or ""."""
+    """Return why each frame was refused, or after what it was accepted again, or ""."""
     history = History()
     gate, told = Gate(load_config(**{f"trust.{name}": value for name, value in trust.items()}), history), []
     for frame in frames:
@@ -104,7 +104,7 @@ def test_one_outlier_is_refused_and_those_after_it_pass():
 
 @pytest.mark.parametrize("metres", [2.0, 30.0])
 def test_a_tracker_that_found_itself_elsewhere_is_believed_after_a_second(metres):
-    """However small the jump: that so far could be travelled in the meantime does not count."""
+    """However small the jump: that the distance could have been travelled meanwhile does not count."""
     frames = [frame_at(100 * i, 0.1 * i + metres * (i >= 5)) for i in range(20)]
     found = verdicts(frames, max_speed_mps=10.0)
     assert found == [""] * 5 + ["pose_jump"] * 10 + ["after pose_jump"] + [""] * 4
@@ -143,7 +143,7 @@ def test_one_map_knows_so_many_sensors():
 
 
 class SlowGate:
-    """The same rules for single frames, told in plain words with NumPy; what it knows is a plain dict."""
+    """The same rules for single frames, written plainly in NumPy; its memory is a plain dict."""
 
     def __init__(self):
         self.trusted, self.streak = None, None
@@ -211,7 +211,7 @@ def test_the_gate_decides_as_the_slow_one(flight):
 
 
 def state_of(voxel_map):
-    """All that a refused frame must leave as it is."""
+    """Everything that a refused frame must not change."""
     coords, cells = voxel_map.storage.blocks()
     view = voxel_map.viewpoint
     pose = None if view is None else (view.T_world_camera.tobytes(), view.stamp_ns)

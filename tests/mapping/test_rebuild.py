@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map with corrected poses is bit for bit the map that a new run makes of its frames at these poses."""
+"""A map with corrected poses is bit for bit the map of a new run with its frames at these poses."""
 
 import signal
 import threading
@@ -91,7 +91,7 @@ def differing(a, b):
 
 
 def come_meanwhile(monkeypatch, mapper, frames):
-    """Let frames come while poses are corrected, once others have been mapped again."""
+    """Let frames arrive while poses are corrected, once others have been mapped again."""
     catch_up, coming = Rebuild.catch_up, [frames]
 
     def meanwhile(self):
@@ -201,7 +201,7 @@ def test_correcting_back_gives_the_first_map(room):
 @pytest.mark.parametrize("kind", ["plain", "int8", "uint8", "times", "two threads", "ray", "sphere", "coarse pixels"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_only_what_moved_frames_see_is_made_anew(kind, seed):
-    """Of cameras in three places those of one place move: what the others saw stays as it is."""
+    """Cameras at one of three places move: the cells seen by the others stay as they are."""
     frames = made_frames(cameras=3, each=16, apart=30.0)
     mapper, heard = mapped(frames, **MAPS[kind]), []
     mapper.map.listeners.append(heard.append)
@@ -323,7 +323,7 @@ def test_listeners_hear_what_changed():
 
 
 def test_nothing_is_shown_any_longer_where_nothing_was_seen():
-    """Where all frames are moved far, blocks vanish."""
+    """If all frames move far, blocks vanish."""
     frames = made_frames()
     mapper = mapped(frames)
     live = LiveProjection(mapper.map, (0.0, 1.0), floor=0.0)
@@ -380,7 +380,7 @@ def test_ctrl_c_while_the_result_is_put_in_place_leaves_it_whole(monkeypatch, ob
 
 
 def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
-    """With a budget, frames that come may push others out that were mapped again already."""
+    """With a budget, new frames may displace others that were mapped again already."""
     frames = [frame for frame in made_frames(each=40) if not frame.fault]
     mapper = mapped(frames[:6], **{"map.frames_budget": "40 kB"})
     come_meanwhile(monkeypatch, mapper, frames[6:])
@@ -393,7 +393,7 @@ def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
 
 
 def test_frames_that_cannot_be_kept_meanwhile_start_it_anew(monkeypatch):
-    """A part made anew without a frame that came and was not kept would be of other frames than the rest."""
+    """A part rebuilt without a new frame that was not kept would be made of other frames than the rest."""
     frames = [frame for frame in made_frames(cameras=3, each=20, apart=30.0) if not frame.fault]
     mapper = mapped(frames[:30])
     mapper.map.kept_frames.spacing = 1e3  # as after many more frames
@@ -452,7 +452,7 @@ def test_stamps_of_several_sensors_need_their_name():
     assert is_as_new(mapper, moved)
     repeated = mapped([frames[0], frames[2], replace(frames[2])], **{"trust.ordered": False})
     assert "without such" in refused(repeated, {(frame.sensor, frame.stamp_ns): T})
-    assert f"('{frame.sensor}'); only maps without such" in refused(repeated, {frame.stamp_ns: T})
+    assert f"('{frame.sensor}'); such a map cannot be corrected" in refused(repeated, {frame.stamp_ns: T})
 
 
 def test_a_corrected_map_that_needs_too_much_memory_is_refused():
@@ -497,7 +497,7 @@ def test_a_frame_with_two_poses_is_refused():
 
 
 def test_a_map_counts_as_corrected_before_its_listeners_hear_of_it():
-    """Else a checkpoint that another thread writes then, or a listener that fails, leaves a map to be gone on with."""
+    """Otherwise a checkpoint of another thread, or a listener that fails, leaves a map that could be continued."""
     frames = [frame for frame in made_frames(each=4) if not frame.fault]
     mapper = mapped(frames)
     mapper.map.recording = "walk"

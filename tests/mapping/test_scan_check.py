@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mount that is no rigid motion is refused alike by grids, SLAM and localisation; one of few digits is made exact."""
+"""Grids, SLAM and localisation alike refuse a mount that is not rigid; rounded ones are made exact."""
 
 from dataclasses import replace
 

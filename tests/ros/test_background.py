@@ -10,7 +10,7 @@ from stereovox.ros.background import Background
 
 @pytest.fixture
 def busy():
-    """A background with a piece of work that ends when the event is set, and a list of what was done."""
+    """A background with a task that ends when the event is set, and a list of finished tasks."""
     background, go, done = Background("test"), Event(), []
 
     def work(name):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of sensors that are not those of the poses are reported; replays at any rate, pauses and loops are not."""
+"""Clocks of sensors that differ from the poses' are reported; replays at any rate, pauses and loops are not."""
 
 import made_streams
 import numpy as np

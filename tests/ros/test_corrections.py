@@ -90,7 +90,7 @@ def path(stamps, poses, frame_id="map"):
 
 
 def check_new_run(robot, frames, atol=1e-9):
-    """The map is that of a new run with the poses that its frames have now, and these are as expected."""
+    """The map equals a new run with the present poses of its frames, and these are as expected."""
     kept, new = robot.mapping.mapper.map.kept_frames.frames, Mapping(load_config(**SETTINGS))
     assert len(kept) == len(frames)
     for one, frame in zip(kept, frames, strict=True):
@@ -161,7 +161,7 @@ def test_a_newer_path_replaces_the_one_that_waits():
 
 
 def test_a_path_without_the_stamps_of_its_images_does_not_replace_one_with_them():
-    """RTAB-Map gives all poses the time of the message, but where it is asked for its map."""
+    """RTAB-Map gives all poses the time of the message, except when its map is requested."""
     robot, wanted = Robot().drive(), moved()
     stamps, poses = [frame.stamp_ns for frame in wanted], [frame.T_world_sensor for frame in wanted]
     robot.corrector.on_path(path(stamps, [motion(shift=(1, 0, 0)) @ T for T in poses]))  # runs at once
@@ -204,7 +204,7 @@ def test_paths_that_are_of_no_use_are_told_and_change_nothing():
     robot.corrector.on_path(path(stamps, poses))
     assert "no fixed transform from wheel to a sensor" in robot.log.said[-1]  # it turns
     robot.corrector.on_path(path(stamps, poses, "odom"))
-    assert "it is in frame odom, the map in map; give --world-frame odom" in robot.log.said[-1]
+    assert "it is in frame odom, but the map in map; give --world-frame odom" in robot.log.said[-1]
     robot.corrector.on_path(b"\0\1\0\0\5")
     assert f"the path on {PATH} is not used" in robot.log.said[-1]
     assert robot.correct() == []
@@ -271,7 +271,7 @@ def test_jumps_are_not_noticed_where_odometry_is_not_known_and_that_is_told():
     robot = Robot()
     robot.corrector = JumpCorrections(robot.mapping, robot.poses, "wheels", robot.log)
     robot.drive(1)
-    assert "jumps are not noticed: " in robot.log.said[-1]
+    assert "jumps cannot be detected: " in robot.log.said[-1]
     assert "'wheels'" in robot.log.said[-1]
     robot.poses.world = "odom"
     robot.corrector = JumpCorrections(robot.mapping, robot.poses, "odom", robot.log)
@@ -292,7 +292,7 @@ def test_odometry_as_it_was_is_what_counts_after_a_reset():
     [
         ({"corrected_path": PATH}, {}, "--corrected-path /mapPath: .*map.keep_frames=true"),
         ({"correct_jumps": True}, {}, "--correct-jumps: .*map.keep_frames=true"),
-        ({"corrected_path": PATH, "correct_jumps": True}, {"map.keep_frames": True}, "give it alone"),
+        ({"corrected_path": PATH, "correct_jumps": True}, {"map.keep_frames": True}, "give the path alone"),
         ({"corrected_path": PATH, "poses": "track"}, {"map.keep_frames": True}, "--poses track"),
         ({"correct_jumps": True, "world_frame": "/odom"}, {"map.keep_frames": True}, "--world-frame map"),
     ],

@@ -13,7 +13,7 @@ from stereovox.ros.obstacles import STEP, free_ends
 
 
 def naive(grid, place, reach, blind):
-    """One ray after the other, one step after the other."""
+    """Ray by ray, step by step."""
     cells = round(reach / grid.resolution)
     at = se2.transform(se2.inverse(grid.origin), place[None])[0] / grid.resolution
     states, ends = grid.states, []

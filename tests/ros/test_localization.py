@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localisation scan by scan: what the node knows of where the robot is, and when it does not say so."""
+"""Localisation scan by scan: the robot's pose in the node, and when it is not published."""
 
 from __future__ import annotations
 

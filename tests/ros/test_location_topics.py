@@ -121,10 +121,10 @@ def test_an_initial_pose_places_the_robot(placing):
     [
         ({"frame": "odom"}, "in frame 'odom'; send it in 'map'"),
         ({"x": 500.0}, "outside of the map"),
-        ({"x": np.nan}, "its pose is none"),
-        ({"w": 5.0}, "its pose is none"),
-        ({"variance": -1.0}, "send none below 0"),
-        ({"variance": np.inf}, "send none below 0"),
+        ({"x": np.nan}, "its pose is invalid"),
+        ({"w": 5.0}, "its pose is invalid"),
+        ({"variance": -1.0}, "send finite ones"),
+        ({"variance": np.inf}, "send finite ones"),
     ],
 )
 def test_initial_poses_that_are_none_are_ignored_and_told(placing, change, said):

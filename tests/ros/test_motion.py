@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of the robot's motion: odometry and the transform."""
+"""The node's messages about the robot's motion: odometry and the transform."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node in one process: what it hears, publishes, and is asked to do."""
+"""The node in one process: what it receives, publishes and does on request."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def check_grid(message, expected):
 
 
 def shows(messages, expected):
-    """Return whether the last grid that came is as expected."""
+    """Return whether the last grid received is as expected."""
     try:
         check_grid(messages[-1], expected)
     except (AssertionError, IndexError):
@@ -232,7 +232,7 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     odometry.publish(wire.packed(made.odometry(np.zeros(3), frame.stamp_ns, "odom", "base_link")))
     robot.until(lambda: reports)
     assert [report.refused for report in reports] == [None]
-    assert "/tf is not heard" in capfd.readouterr().err
+    assert "/tf is ignored" in capfd.readouterr().err
     T_world_camera = mapping.mapper.map.viewpoint.T_world_camera
     np.testing.assert_allclose(T_world_camera[:3, 3], [0.1, 0, 0.4], atol=1e-6)
     np.testing.assert_allclose(T_world_camera[:3, 2], [1, 0, 0], atol=1e-4)  # it looks ahead
@@ -254,7 +254,7 @@ def test_names_that_no_topic_has_end_in_one_line(robot):
 
 
 def test_a_corrected_path_changes_what_is_published_and_no_frame_is_lost(robot):
-    """The map and the grid become those of a new run at the path's poses; images go on coming meanwhile."""
+    """The map and the grid become those of a new run at the path's poses; images keep arriving meanwhile."""
     settings = {"voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1}
     other = rclpy.create_node("corrected")
     options = replace(robot.options, corrected_path="/path", path_frame="base_link", out="")
@@ -286,7 +286,7 @@ def test_a_corrected_path_changes_what_is_published_and_no_frame_is_lost(robot):
 
 
 def test_a_jump_of_odometry_in_the_map_is_noticed_while_it_drives(robot):
-    """Here the place of odom in the map comes as a pose; with tf2_msgs it may come by /tf as well."""
+    """Here the pose of odom in the map arrives as a message; with tf2_msgs it may also arrive on /tf."""
     other = rclpy.create_node("jumping")
     options = replace(robot.options, correct_jumps=True, world_frame="map", pose=("/slam=odom",), out="")
     mapping = Mapping(load_config(voxel_size=0.1, **STANDS, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
@@ -312,7 +312,7 @@ def test_a_jump_of_odometry_in_the_map_is_noticed_while_it_drives(robot):
 
 
 def latched(robot, kind, topic):
-    """Return what a subscriber gets that comes now."""
+    """Return the message that a new subscriber gets."""
     robot.listen(kind, topic)
     robot.until(lambda: robot.came[topic])
     return robot.came[topic][0]
@@ -392,7 +392,7 @@ def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
 
 
 def test_several_cameras_make_one_map(robot):
-    """Each with its own topics, camera and mount: one looks ahead, one back, and no frame is taken for another's."""
+    """Each with its own topics, camera and mount: one faces ahead, one back, and no frames are mixed up."""
     back, info, optical = "/back/depth/image_raw", "/back/depth/camera_info", "back_optical_frame"
     turned = np.diag([-1.0, -1, 1, 1])
     other, camera = rclpy.create_node("two_cameras"), replace(CAMERA, fx=30.0, fy=30.0)

@@ -22,7 +22,7 @@ FREE, MARKED, UNTOUCHED = 0, 254, 255
 
 
 def room() -> OccupancyGrid:
-    """A free square of 6 m, walls round it, the robot in its middle, unknown at its feet."""
+    """A free square of 6 m with walls around it, the robot in its middle, unknown cells at its feet."""
     cells = np.full((160, 160), -1, np.int8)
     cells[20:140, 20:140] = 0
     cells[[20, 139], 20:140] = 100
@@ -38,7 +38,7 @@ def with_box(grid: OccupancyGrid, value: int = 100) -> OccupancyGrid:
 
 
 class Costmap:
-    """Nav2's ObstacleLayer: clears along Bresenham's line to each point, the last cell as well, then marks."""
+    """Nav2's ObstacleLayer: clears along Bresenham's line to each point, including the last cell, then marks."""
 
     def __init__(self):
         self.cells = np.full((160, 160), UNTOUCHED, np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node is given: by options, by parameters, wrongly."""
+"""The node's options and parameters, right and wrong."""
 
 import builtins
 import subprocess
@@ -73,12 +73,12 @@ def test_something_must_be_mapped():
         (["--depth", DEPTH, "--odometry", "/odom", "--poses", "track"], "--odometry /odom"),
         (["--depth", DEPTH, "--ros-args", "-p", "ros.poses:=trak"], "did you mean"),
         (["--depth", DEPTH, "--corrected-path", "/mapPath"], "add --set map.keep_frames=true"),
-        (["--depth", DEPTH, "--correct-jumps", "--set", "dimensions=2"], "needs a map in space"),
+        (["--depth", DEPTH, "--correct-jumps", "--set", "dimensions=2"], "needs a 3-D map"),
         (["--depth", DEPTH, "--ros-args", "-p", "ros.correct_jumps:=true"], "add --set map.keep_frames=true"),
-        (["--depth", DEPTH, "--poses", "track", "--load", "x.svox"], "does not know where it is"),
+        (["--depth", DEPTH, "--poses", "track", "--load", "x.svox"], "cannot be located"),
         (
             ["--lidar", "/scan", "--poses", "slam", "--set", "dimensions=2", "--load", "x.yaml"],
-            "does not know where it is",
+            "cannot be located",
         ),
         (["--depth", DEPTH, "--poses", "slam"], "give --lidar /scan"),
         (["--depth", DEPTH, "--poses", "slm"], "did you mean 'slam'"),

@@ -27,7 +27,7 @@ PATIENT = [word for name in ("late_s:=30.0", "wait_s:=30.0", "queue:=100") for w
 
 
 def played(bag: Path, out: Path, env: dict[str, str], clock: str, *options: str) -> dict:
-    """Play the bag to a node that saves at SIGTERM, of which two come; return what it says."""
+    """Play the bag to a node that saves at SIGTERM, which arrives twice; return its output."""
     words = ["ros2", "--voxel-size", "0.1", "--out", str(out), "--depth", DEPTH, "--json", *options]
     command = [sys.executable, "-m", "stereovox", *words]
     player = [sys.executable, str(PLAYER), str(bag), "2", clock, DEPTH]

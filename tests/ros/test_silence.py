@@ -33,7 +33,7 @@ class Node:
     [
         ({"/c/depth": (IMAGE, 1), "/c/info": (OTHER, 1), "/x": (IMAGE, 0)}, 0, "sensor_msgs/Image is on /c/depth"),
         ({"/c/info": (OTHER, 1)}, 0, "ROS_DOMAIN_ID"),
-        ({}, 1, "large images need room"),
+        ({}, 1, "large images need larger buffers"),
     ],
 )
 def test_a_topic_on_which_nothing_comes_is_told_with_what_there_is(others, publishers, said):
@@ -44,7 +44,7 @@ def test_a_topic_on_which_nothing_comes_is_told_with_what_there_is(others, publi
         silence.update()
         told.append(len(node.said))
     assert told == [0, 1, 1, 2]
-    assert node.said[0].startswith("nothing has come on /depht: ")
+    assert node.said[0].startswith("no message on /depht: ")
     assert said in node.said[0]
     received["/depht"] += 1
     now[0] += AGAIN_S

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/tf without `tf2_msgs`: the bytes, and that rclpy takes the class for the package's own."""
+"""/tf without `tf2_msgs`: the bytes, and that rclpy accepts the class as the package's own."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_is_published_arrives_and_tells_the_type_of_the_package(made, monke
 
 
 def described(node, executor) -> str:
-    """The field of the message, as the node's type description service tells it."""
+    """The field of the message, by the node's type description service."""
     from type_description_interfaces.srv import GetTypeDescription
 
     client = node.create_client(GetTypeDescription, "/transforms/get_type_description")

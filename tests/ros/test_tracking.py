@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's poses without tf: what is tracked, what it says of the robot and of other sensors, what is refused."""
+"""The node's poses without tf: the tracked camera, the robot and other sensors, and refusals."""
 
 from __future__ import annotations
 

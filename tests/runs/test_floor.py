@@ -86,7 +86,7 @@ def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
 
 
 def test_after_loops_the_map_is_that_of_a_new_run_at_the_final_poses(tmp_path):
-    """Cell for cell; readings that were mapped on the way, before a loop was closed, would stand where they do not."""
+    """Cell for cell; readings that were mapped before a loop was closed would be in the wrong place."""
     pytest.importorskip("gtsam")
     round_twice = [(1, 1), (13, 1), (13, 9), (1, 9), (1, 1), (13, 1), (13, 4)]
     scans = drive(ring(), along(round_twice), drift=(1.03, 0.01), beams=91)
@@ -128,7 +128,7 @@ def test_a_run_that_is_told_to_stop_is_saved(tmp_path, then):
     told = []
     with pytest.raises(KeyboardInterrupt):
         sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[Seen(5, then)], notify=told.append, checkpoint_s=0)
-    assert told[1:] == [f"stopped after 5 of 16 readings; they are saved in {tmp_path / 'a.yaml'}"]
+    assert told[1:] == [f"stopped after 5 of 16 readings; saved in {tmp_path / 'a.yaml'}"]
     sv.map_floor(DRIVE, tmp_path / "five.yaml", **LIDAR, frames=":5")
     same_cells(tmp_path / "a.yaml", tmp_path / "five.yaml")
 
@@ -189,13 +189,13 @@ def test_going_on_keeps_the_cells_that_are_there(tmp_path):
     assert (more.map.state(points) == whole.state(points)).mean() > 0.95  # per cents are rounded in between
     other = sv.map_floor(DRIVE, tmp_path / "b.yaml", **LIDAR, frames=":1", resume=tmp_path / "a.yaml")
     assert len(other.map.cells()[0]) >= len(more.map.cells()[0])
-    with pytest.raises(sv.StereovoxError, match="SLAM makes a frame of its own"):
+    with pytest.raises(sv.StereovoxError, match="SLAM starts a new frame"):
         sv.map_floor(DRIVE, tmp_path / "a.yaml", poses="slam", resume=True)
 
 
 def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
     out = tmp_path / "a.yaml"
-    with pytest.raises(sv.StereovoxError, match="no map to go on with; start it without resume"):
+    with pytest.raises(sv.StereovoxError, match="no map to continue; start without resume"):
         sv.map_floor(DRIVE, out, resume=True)
     sv.map_floor(DRIVE, out, **LIDAR)
     before = out.read_bytes(), out.with_suffix(".pgm").read_bytes()
@@ -205,11 +205,11 @@ def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
         (DRIVE, out, {"use": "sonar"}, "use 'sonar': give depth, lidar or both"),
         (DRIVE, out, {"frames": "99:"}, "selects none of"),
         (DRIVE, out, {"poses": "gps"}, "poses gps: give slam, odometry, or the .yaml"),
-        (DRIVE, out, {"poses": "odometry", "start": (0, 0, 0)}, "says where in a map"),
+        (DRIVE, out, {"poses": "odometry", "start": (0, 0, 0)}, "is a pose in a map"),
         (DRIVE, out, {"mode": "gray"}, "no mode 'gray'"),
         (DRIVE, out, {"checkpoint_s": -1.0}, "give seconds"),
         (DRIVE, out, {"nonsense": 1}, "nonsense"),
-        (Unusable(), out, LIDAR, "not one reading could be used, no map is written"),
+        (Unusable(), out, LIDAR, "not one reading could be used, so no map is written"),
     ):
         with pytest.raises(sv.StereovoxError, match=words) as caught:
             sv.map_floor(source, where, **more)
@@ -223,7 +223,7 @@ def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
 
 
 class Unusable:
-    """A robot of one's own, which never knows where it is."""
+    """A custom robot that never knows its pose."""
 
     name, notes, frames, truth = "lost", (), (), None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which poses a run uses, for all that it may be given."""
+"""The poses that a run uses, for all possible arguments."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def test_a_layout_whose_files_of_poses_are_all_missing(tmp_path):
     for file in where.glob("*.pose.txt"):
         file.unlink()
     chosen = choose_poses(where, None, None)
-    assert (chosen.poses, "none of the frames looked at has a pose" in chosen.why) == ("track", True)
+    assert (chosen.poses, "none of the frames inspected has a pose" in chosen.why) == ("track", True)
     assert [frame.depth.size > 0 for frame in chosen.source] == [True] * 4
 
 

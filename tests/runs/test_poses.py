@@ -63,7 +63,7 @@ def test_a_folder_without_poses_gives_the_map_that_it_gives_with_them(tmp_path):
     found, lines = mapped(unposed(tmp_path / "a"), tmp_path / "a.svox")
     given, said = mapped(unposed(tmp_path / "b", poses=True), tmp_path / "b.svox")
     assert (found.poses, found.lost, found.map.frames, given.poses) == ("track", [], 10, "given")
-    assert [line for line in lines if "tracked by its own images" in line and "no poses" in line]
+    assert [line for line in lines if "tracked by visual odometry" in line and "no poses" in line]
     assert not [line for line in said if "tracked" in line]
     T = true_start() @ np.linalg.inv(level_start(sv.open_source(ROOM), found.map.config))
     walls = found.map.occupied() @ T[:3, :3].T + T[:3, 3]
@@ -100,7 +100,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, stop):
     with pytest.raises(KeyboardInterrupt):
         mapped(where, out, observers=[Stop(stop)])
     rest, lines = mapped(where, out, resume=True)
-    assert f"going on after frame {stop}" in lines
+    assert f"continuing after frame {stop}" in lines
     same_cells(whole.map, rest.map)
     assert [(span.first, span.last) for span in rest.lost] == [
         (max(span.first, stop), span.last) for span in whole.lost if span.last >= stop
@@ -134,13 +134,13 @@ def test_what_cannot_be_had_is_one_line(tmp_path):
     with pytest.raises(StereovoxError, match=r"^level: a map with tracked poses"):
         mapped(where, tmp_path / "m.svox", level=True)
     dark = unposed(tmp_path / "b", 4, covered=range(4))
-    with pytest.raises(StereovoxError, match=r"not one frame could be used, no map is written \(.*move slower"):
+    with pytest.raises(StereovoxError, match=r"not one frame could be used, so no map is written \(.*move slower"):
         mapped(dark, tmp_path / "m.svox")
     assert not (tmp_path / "m.svox").exists()
 
 
 class Live(Stream):
-    """A camera that sends the room and does not know where it is."""
+    """A camera that sends the room without poses."""
 
     name, posed = "live", False
 

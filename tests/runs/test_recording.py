@@ -94,7 +94,7 @@ def test_it_makes_the_map_of_the_command(tmp_path):
 
 
 class Breaking:
-    """A recording of which a frame cannot be read; another has a fault."""
+    """A recording with an unreadable frame and one with a fault."""
 
     def __init__(self, bad):
         self._frames, self._bad = list(open_stream(SOURCE, ":8")), bad
@@ -114,7 +114,7 @@ class Breaking:
 
 
 class Stateful:
-    """A recording that can only be read on; its readers are told what belongs to the frame that it gave last."""
+    """A recording that can only be read forwards; it gives its readers data of its last frame."""
 
     def __init__(self):
         self._frames, self.last = list(open_stream(SOURCE, ":4")), None
@@ -179,7 +179,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
         assert going.remaining == 7
         assert going.mapper.config.voxel_size == 0.1  # the map's own settings
         assert len(going.finish().reports) == 7
-    assert told[-1] == "going on after frame 5"
+    assert told[-1] == "continuing after frame 5"
     sv.map_recording(SOURCE, tmp_path / "whole.svox", **SETTINGS)
     same_cells(tmp_path / "a.svox", tmp_path / "whole.svox")
     again = sv.map_recording(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", notify=told.append)
@@ -193,12 +193,12 @@ def test_who_goes_on_without_the_kept_frames_is_told(tmp_path):
     sv.map_recording(SOURCE, out, resume=True, frames=":6", notify=told.append)
     assert not any("given up" in line for line in told)
     sv.map_recording(SOURCE, out, resume=True, frames=":8", notify=told.append, **{"map.keep_frames": False})
-    assert any("the 6 frames that the map kept are given up (map.keep_frames=false)" in line for line in told)
+    assert any("the 6 frames that the map kept are dropped (map.keep_frames=false)" in line for line in told)
 
 
 @pytest.mark.parametrize("how", ["damaged", "gone"])
 def test_kept_frames_that_are_lost_can_be_given_up(tmp_path, how):
-    """The command that the message names goes on with the map, which then merges by adding up."""
+    """The command in the message continues the map, which then merges by adding up evidence."""
     kept = {**SETTINGS, "frames": ":6", "map.keep_frames": True}
     one, two = (sv.map_recording(SOURCE, tmp_path / name, **kept).out for name in ("a.svox", "b.svox"))
     pack = one / json.loads((one / "manifest.json").read_text())["kept_frames"]["packs"][0]
@@ -223,7 +223,7 @@ def test_who_goes_on_with_a_map_in_boxes_is_said(tmp_path):
 
 def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
     out = tmp_path / "a.svox"
-    with pytest.raises(sv.StereovoxError, match="no map to go on with"):
+    with pytest.raises(sv.StereovoxError, match="no map to continue"):
         sv.map_recording(SOURCE, out, resume=True)
     sv.map_recording(SOURCE, out, **SETTINGS)
     for source, more, words in (
@@ -248,11 +248,11 @@ def test_a_run_says_which_map_it_replaces(tmp_path):
     for frames in (":3", ":2"):
         sv.map_recording(SOURCE, out, voxel_size=0.1, frames=frames, notify=notes.append)
     (line,) = (note for note in notes if "replaces" in note)
-    assert line == f"note: {out} replaces the map of 3 frames made of '{sv.load_map(out).recording}' that is there"
+    assert line == f"note: {out} replaces an older map of 3 frames made of '{sv.load_map(out).recording}'"
     sv.map_recording(SOURCE, out, voxel_size=0.1, frames=":4", resume=True, notify=notes.append)
     assert sum("replaces" in note for note in notes) == 1
     (out / "manifest.json").write_text("{")
-    assert recording.replaces(out) == f"note: {out} replaces a damaged map that is there"
+    assert recording.replaces(out) == f"note: {out} replaces a damaged map"
 
 
 def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
@@ -265,7 +265,7 @@ def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
 
 
 def test_a_live_camera_that_delivers_nothing_ends(tmp_path):
-    with pytest.raises(sv.StereovoxError, match="not one of 100 frames could be used, no map is written"):
+    with pytest.raises(sv.StereovoxError, match="not one of 100 frames could be used; no map is written"):
         sv.map_recording(Live(0), tmp_path / "a.svox", voxel_size=0.2)
     assert not (tmp_path / "a.svox").exists()
     with pytest.raises(KeyboardInterrupt):
@@ -274,7 +274,7 @@ def test_a_live_camera_that_delivers_nothing_ends(tmp_path):
 
 
 def test_a_map_made_level_with_a_profile(tmp_path):
-    """A profile keeps its sizes; which way is up is found all the same."""
+    """A profile keeps its sizes; the up direction is still found."""
     box = "sim:box?image_width=160"
     result = sv.map_recording(box, tmp_path / "a.svox", profile="default", level=True, voxel_size=0.4)
     assert result.map.config.up == "z"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run takes from a look at the recording, and maps that are made level."""
+"""What a run takes from a survey of the recording, and levelled maps."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def fullest_layer(voxel_map, axis):
 def test_up_is_told_and_kept_with_the_map(recording, tmp_path):
     made, lines = run(recording, tmp_path / "m.svox")
     (line,) = [line for line in lines if "up is" in line]
-    assert "with --level the map is as well" in line
+    assert "with --level the map is too" in line
     assert "--set up=" in line
     _, lines = run(recording, tmp_path / "l.svox", level=True)
     assert ["the map is turned upright" in line for line in lines if "up is" in line] == [True]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a quick look at a recording finds, and what it does not claim to know."""
+"""The findings of a quick survey of a recording, and what it does not claim to know."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def degrees(a, b):
 
 
 def looking(forward, up, count=6):
-    """Poses of a camera that looks along `forward`, moving sideways."""
+    """Poses of a camera that faces along `forward`, moving sideways."""
     forward, up = np.asarray(forward, float), np.asarray(up, float)
     T = np.eye(4)
     T[:3, :3] = np.stack([np.cross(forward, up), -up, forward], axis=1)
@@ -87,7 +87,7 @@ def test_a_camera_that_looks_straight_down_does_not_take_its_way_for_up(tmp_path
     settings, lines = found.settings({})
     assert not found.up.sure
     assert "up" not in settings
-    assert any("which way is up is not certain" in line for line in lines)
+    assert any("the up direction is uncertain" in line for line in lines)
 
 
 def test_a_camera_held_on_its_side_does_not_take_walls_for_floors(tmp_path):

@@ -86,7 +86,7 @@ def test_what_is_wrong_is_one_line_and_leaves_the_file(tmp_path):
     (tmp_path / "way.tum").write_text("as it was")
     dark = unposed(tmp_path / "dark", 3, covered=range(3))
     for source, out, said in (
-        (dark, "way.tum", "not one frame could be tracked, nothing is written"),
+        (dark, "way.tum", "not one frame could be tracked; nothing is written"),
         (tmp_path / "nowhere", "way.tum", "no such folder"),
         (dark, "way.svox", r"way\.svox"),
     ):

@@ -24,7 +24,7 @@ OPTICAL = "camera_imu_optical_frame"
 
 
 def recorded(path, *, wrong=None, force=1.0, frame_id=OPTICAL):
-    """Frames of a room and an IMU that stands still for 1 s before; wrong: (3, 3) axes of the rates."""
+    """Frames of a room and an IMU at rest for 1 s before; wrong: (3, 3) axes of the rates."""
     frames = [replace(frame, stamp_ns=10**10 + frame.stamp_ns) for frame in room(COUNT)]
     poses = [ASLANT @ frame.T_world_sensor for frame in frames]
     stamps, rates, forces = felt_along([frame.stamp_ns for frame in frames], poses, before_s=1.0)
@@ -37,7 +37,7 @@ def recorded(path, *, wrong=None, force=1.0, frame_id=OPTICAL):
 
 
 def off_up(found):
-    """Degrees between what is up for the first frame and what truly is."""
+    """Degrees between the up direction of the first frame and the true one."""
     true = (ASLANT @ room(COUNT)[0].T_world_sensor)[2, :3]
     return float(np.degrees(np.arccos(true @ found.T_world_sensor[0][2, :3])))
 

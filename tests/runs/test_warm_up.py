@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nothing is compiled while the robot drives: in a process of its own, where nothing has been used before."""
+"""Nothing is compiled while the robot drives: in a fresh process, which has used nothing before."""
 
 from __future__ import annotations
 

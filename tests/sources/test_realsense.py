@@ -334,7 +334,7 @@ def test_map_gives_up_on_a_camera_without_poses(camera, tmp_path, capsys):
         code, said = mapped(capsys, "realsense:", "--out", tmp_path / "m.svox")
     assert code == 2
     assert "not one of 100 frames could be used" in said.err
-    assert "?pose=fixed" in next(line for line in said.err.splitlines() if "tracked by its own images" in line)
+    assert "?pose=fixed" in next(line for line in said.err.splitlines() if "tracked by visual odometry" in line)
 
 
 def test_map_is_saved_when_the_camera_falls_silent(camera, tmp_path, capsys, monkeypatch):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line. Text for people goes to stderr; with --json the last line of stdout is one JSON object.
 
-Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 3 the result is written but
-doubted (its `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
+Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 3 the result is written but in
+doubt (its `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ GROUPS = {
 }
 """Groups of the help: the folder of their commands, and the commands.
 
-Each command is a module with a docstring, `EXAMPLES` (a line each), `add_arguments(parser)` and
+Each command is a module with a docstring, `EXAMPLES` (one per line), `add_arguments(parser)` and
 `run(arguments) -> dict`; it may name its `GROUP`. The module of a command that is a Python keyword has a trailing
-underscore. Other packages add commands as entry points `name = "module"` of the group `stereovox.commands`.
+underscore. Other packages add commands as entry points `name = "module"` in the group `stereovox.commands`.
 """
 COMMANDS = {name: f"stereovox.cli.{folder}.{name}" for folder, names in GROUPS.values() for name in names}
 COMMANDS |= {"import": "stereovox.cli.map.import_", "calibrate": "stereovox.cli.calibrate"}
@@ -42,15 +42,15 @@ COMMANDS |= {"import": "stereovox.cli.map.import_", "calibrate": "stereovox.cli.
 
 DOUBTED = 3
 """Exit status of a command that wrote a map which may be wrong, or a trajectory with gaps."""
-UNUSABLE = "check that it exists and that you may use it"
+UNUSABLE = "check that it exists and that you have permission"
 GLOBAL_OPTIONS = ("-h", "--help", "--version")
-"""Options that may stand before a command or without one."""
+"""Options that may come before a command or without one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = sys.argv[1:] if argv is None else argv
-    if "_ARGCOMPLETE" in os.environ:  # the shell asks how a line goes on
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks for completions
         _complete(os.environ.get("COMP_LINE", "").split()[1:])
     try:
         _check_command(words)
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk
         where = f"{error.filename}: " if error.filename else ""
         full = error.errno in DISK_FULL
-        cure = "what was being written is not complete; remove it, and make room" if full else UNUSABLE
+        cure = "the file being written is incomplete; remove it, and make room" if full else UNUSABLE
         return _fail(f"{where}{error.strerror or error}; {cure}", 2, words)
     except MemoryError:
         return _fail("not enough memory; use larger cells (--voxel-size) or a shorter --max-range", 2)
@@ -76,9 +76,9 @@ def _print_json(result: dict[str, Any]) -> int:
         print(json.dumps(result, allow_nan=False))
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tries again at exit
-        if not isinstance(error, BrokenPipeError):  # a reader that has read enough is no mistake
-            return _fail(f"standard output: {error.strerror}; send it to a place that has room", 2)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # otherwise Python tries again at exit
+        if not isinstance(error, BrokenPipeError):  # a reader that stops early is no mistake
+            return _fail(f"standard output: {error.strerror}; redirect it to a place with room", 2)
     return 0
 
 
@@ -129,11 +129,11 @@ class _Parser(argparse.ArgumentParser):
         option = word.partition("=")[0]
         if option.startswith("-"):
             self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options, '--')}")
-        self.error(f"'{word}' is one argument too many")
+        self.error(f"unexpected argument '{word}'")
 
 
 def _complete(words: Sequence[str]) -> None:
-    """Print the words that may come next, for the shell, and exit; do nothing if argcomplete is not installed."""
+    """Print the possible next words for the shell, and exit; do nothing if argcomplete is not installed."""
     try:
         from argcomplete import autocomplete
     except ImportError:
@@ -150,11 +150,11 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _parser(words: Sequence[str]) -> _Parser:
-    """Return the parser of the command that `words` begin with, or of all commands."""
+    """Return the parser of the command at the start of `words`, or of all commands."""
     parser = _Parser(prog="stereovox", description=stereovox.__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    one = bool(words) and not words[0].startswith("-")  # the modules of all take long to import
+    one = bool(words) and not words[0].startswith("-")  # importing the modules of all commands takes long
     modules = {words[0]: command_module(words[0])} if one else _all_modules()
     for name, module in modules.items():
         about = str(module.__doc__).strip()
@@ -175,16 +175,16 @@ def _grouped(modules: Mapping[str, Any]) -> str:
 
 
 def commands() -> dict[str, str]:
-    """Return the module of each command by its name: the built-in ones, then those of other packages by name."""
+    """Return the module of each command by name: the built-in ones, then other packages' in alphabetical order."""
     others = {entry.name: entry.value for entry in entry_points(group="stereovox.commands")}
     return COMMANDS | {name: others[name] for name in sorted(others) if name not in COMMANDS}
 
 
 def _check_command(words: Sequence[str]) -> None:
-    """Raise an error that suggests the right command or order of options, which argparse does not."""
+    """Raise an error that suggests the right command or order of options, as argparse does not."""
     if words and words[0].startswith("-") and words[0] not in GLOBAL_OPTIONS:
         option, command = words[0].partition("=")[0], next((word for word in words if word in commands()), "COMMAND")
-        raise StereovoxError(f"'{option}' stands before the command; write it after: stereovox {command} ... {option}")
+        raise StereovoxError(f"'{option}' is before the command; write it after: stereovox {command} ... {option}")
     empty = next((word for word in words if word.startswith("--") and word.endswith("=--")), None)
     if empty is not None:  # argparse takes the value for the end of all options
         raise StereovoxError(f"'{empty}': '--' is no value; give another")
@@ -203,7 +203,7 @@ def command_module(name: str) -> Any:
 
 
 def _all_modules() -> dict[str, Any]:
-    """Return the modules of all commands; those of other packages that cannot be imported are noted and left out."""
+    """Return the modules of all commands; those of other packages that cannot be imported are skipped with a note."""
     found = {}
     for name in commands():
         try:

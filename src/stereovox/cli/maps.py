@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid
 
 Doubts = Sequence[dict[str, Any]]
-"""As `mostly_lost` returns them."""
+"""Doubts as `mostly_lost` returns them."""
 
 
 def check_new(out: str, *inputs: str) -> None:
@@ -27,27 +27,27 @@ def check_new(out: str, *inputs: str) -> None:
     from stereovox.maps.files.store import check_target
 
     if os.path.realpath(out) in map(os.path.realpath, inputs):
-        raise StereovoxError(f"{out}: is what the new map is made of; give the new one another name")
+        raise StereovoxError(f"{out}: is an input of the new map; give the new one another name")
     check_in_space(out)
     check_target(Path(out))
 
 
 def name_beside(path: str, what: str) -> str:
-    """Return the name of a map made of another one, `NAME-what.svox` here. Raises StereovoxError if it is taken."""
+    """Return the name of a map made from another one, `NAME-what.svox` here. Raises StereovoxError if it exists."""
     out = f"{Path(path).resolve().stem}-{what}.svox"
     if Path(out).exists():
-        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
+        raise StereovoxError(f"{out}: already exists; replace it with --out {shlex.quote(out)}, or give another name")
     return out
 
 
 def save_new(voxel_map: VoxelMap, out: str, doubts: Doubts = ()) -> dict[str, Any]:
-    """Save a map, print what it contains, and return that with the keys of `info`, and the `doubts` if there are."""
+    """Save a map, print its contents, and return them with the keys of `info`, and any `doubts`."""
     voxel_map.save(out)
     return describe_saved(voxel_map, out, doubts)
 
 
 def describe_saved(voxel_map: VoxelMap, out: str, doubts: Doubts = ()) -> dict[str, Any]:
-    """Print what a map contains that was saved to `out`, and return that with the keys of `info`, and the `doubts`."""
+    """Print the contents of a map saved to `out`, and return them with the keys of `info`, and any `doubts`."""
     bounds = voxel_map.bounds()
     result = {
         "out": out,
@@ -88,7 +88,7 @@ def check_new_floor(out: str, *inputs: str | Path) -> None:
     """Raise StereovoxError if the picture or .yaml of a new floor map would overwrite one of its `inputs`."""
     written = {os.path.realpath(Path(out).with_suffix(ending)) for ending in FLOOR_READABLE}
     if written & {os.path.realpath(file) for file in inputs}:
-        raise StereovoxError(f"{out}: would overwrite what it is made of; give the new map another name")
+        raise StereovoxError(f"{out}: would overwrite its own input; give the new map another name")
 
 
 def dimensions(path: str) -> int:
@@ -100,7 +100,7 @@ def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None
     """Raise StereovoxError for the first of these options that was given although it does not apply."""
     for name in names:
         value = getattr(arguments, name)
-        if not (value is None or value is False or value == []):  # a 0 was given, too
+        if not (value is None or value is False or value == []):  # a 0 counts as given
             raise StereovoxError(f"--{name.replace('_', '-')}: {why}; leave the option out")
 
 
@@ -134,12 +134,12 @@ def _what_is_there(path: Path) -> str:
     if not os.path.exists(path):
         return "no stereovox map here, nor anything else; check the name"
     if dimensions(str(path)) == 2:
-        return "is the map of a floor; eval, info, picture and grid take it, this command wants one in space"
+        return "is the map of a floor; eval, info, picture and grid take it, but this command needs a 3-D map"
     entries = sorted(path.iterdir()) if path.is_dir() else []
     candidate = next((folder for folder in entries if is_map(folder)), None)
     if candidate:
         return f"no stereovox map here (did you mean {candidate}?)"
     if is_recording(path):
         make = command_line("map", path, "--out", f"{path.resolve().stem}.svox")
-        return f"no stereovox map here but a recording; make a map of it with: {make}"
+        return f"no stereovox map here, but a recording; make a map of it with: {make}"
     return "no stereovox map here (a map is a folder with a manifest.json); make one with: stereovox map"

@@ -22,13 +22,13 @@ MAX_FILE = 10_000
 CHECKPOINT_S = 10.0
 """Copy of `runs.engine.CHECKPOINT_S`, so that `--help` need not import it."""
 OWN_OPTIONS = ("voxel_size", "integrator", "max_range", "threads", "device")
-"""Settings that may have an option of their own."""
+"""Settings that may have their own option."""
 
 
 USUAL: dict[str, dict[str, Any]] = {
     "profile": {"metavar": "P", "help": "profile name or TOML file (default)"},
     "voxel-size": {"type": float, "metavar": "M", "help": "cell size in metres"},
-    "max-range": {"type": float, "metavar": "M", "help": "largest depth in metres that is used"},
+    "max-range": {"type": float, "metavar": "M", "help": "largest depth to use, in metres"},
     "threads": {"type": int, "metavar": "N", "help": "threads (1); the map does not depend on it"},
     "frames": {"metavar": "A:B:S", "help": "only these frames, as a Python slice"},
     "camera": {"metavar": "FILE", "help": "camera file (camera.toml) that replaces the recording's own"},
@@ -49,7 +49,7 @@ def numbers_of(option: str, text: str, names: str) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != len(names.split(",")) or any(map(math.isnan, numbers)):
-        raise StereovoxError(f"{option} {text}: write {names}, numbers in metres with commas and no blanks")
+        raise StereovoxError(f"{option} {text}: write {names}, numbers in metres with commas and no spaces")
     return numbers
 
 
@@ -84,7 +84,7 @@ def transform_of(text: str) -> Transform:
     if numbers.size == 7 and np.isfinite(numbers).all() and numbers[3:].any():
         return from_quaternion(numbers[:3], numbers[3:])
     if numbers.size != 16 or not np.isfinite(numbers).all():
-        raise StereovoxError(f"{where}: write tx,ty,tz,qx,qy,qz,qw, or name a file with these or with a 4x4 matrix")
+        raise StereovoxError(f"{where}: write tx,ty,tz,qx,qy,qz,qw, or name a file with these or a 4x4 matrix")
     try:
         return rigid(numbers.reshape(4, 4))
     except StereovoxError as error:
@@ -136,7 +136,7 @@ def add_settings(parser: ArgumentParser, example: str) -> None:
 
 
 def options_of(kind: type[RunOptions], arguments: Namespace) -> dict[str, Any]:
-    """Return what the command line says about a run: those of its options that the command has, and settings."""
+    """Return the options of a run from the command line: those that the command has, and settings."""
     settings, names = overrides(arguments), kind.names()
     for name in sorted(set(settings) & set(names)):
         option = f"use --{name.removesuffix('_s').replace('_', '-')}"
@@ -157,7 +157,7 @@ def overrides(arguments: Namespace) -> dict[str, Any]:
             raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_free=0.3")
         if key.strip() in ("profile", "resume"):
             raise StereovoxError(f"--set {setting}: this is not a setting; use --{key.strip()}")
-        if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
+        if key.strip() in ("tiles", "self"):  # other arguments of `Mapper`
             raise StereovoxError(f"--set {setting}: this is not a setting; leave it out")
         found[key.strip()] = parse_value(value.strip())
     named = {name: getattr(arguments, name, None) for name in OWN_OPTIONS}

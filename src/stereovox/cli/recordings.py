@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stereovox.opening import Stream
 
 LIVE_FRAMES = 60
-"""Number of frames to take from a live camera where --frames has no end."""
+"""Number of frames to take from a live camera if --frames has no end."""
 
 
 def add_recordings(parser: ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def add_recordings(parser: ArgumentParser) -> None:
 
 
 def check_outputs(out: str, report: str | None = None) -> None:
-    """Raise StereovoxError before the work if a result could not be written or `out` does not end in .toml."""
+    """Raise StereovoxError, before the work, if a result cannot be written or `out` does not end in .toml."""
     if Path(out).suffix != ".toml":
         raise StereovoxError(f"--out {out}: give a name that ends in .toml")
     if os.path.isdir(out):
@@ -64,7 +64,7 @@ def read_walls(
 ) -> list[WallRecording]:
     """Return the walls of the recordings; `distances` as for `check_distances`, `conditions` likewise.
 
-    camera: a camera file that replaces theirs. raw: use the measured depths without any correction.
+    camera: a camera file that replaces their own. raw: use the measured depths without any correction.
     """
     measured, named = distances or [None] * len(names), conditions or [""] * len(names)
     return [
@@ -88,7 +88,7 @@ def _read(
     for note in stream.notes:
         say(f"note: {note}")
     if raw and stream.camera.correction:
-        say(f"note: {name}: its depth correction is left out here: a new one is to be found")
+        say(f"note: {name}: its depth correction is ignored here, since a new one is estimated")
     count = stream.length
     if count is None and (frames is None or parse_slice(frames).stop is None):
         count = LIVE_FRAMES
@@ -106,7 +106,7 @@ def check_count(names: Sequence[str], given: Sequence[object], option: str) -> N
 
 
 def check_distances(names: Sequence[str], distances: Sequence[float], option: str = "--distance") -> None:
-    """Raise StereovoxError unless there is a valid distance for each recording, or none at all."""
+    """Raise StereovoxError unless each recording has a valid distance, or none has one."""
     check_count(names, distances, option)
     for distance in distances:
         if not 0 < distance < 1000:

@@ -43,7 +43,7 @@ def open_noting(name: str) -> Robot:
 
 
 def print_trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
-    """Print and return the error of the trajectory; empty if the true one is not known."""
+    """Print and return the error of the trajectory; empty if the true one is unknown."""
     if robot.truth is None:
         return {}
     from stereovox.evaluate.trajectory import trajectory
@@ -55,6 +55,6 @@ def print_trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
 
 
 def picture_line(out: Path) -> str:
-    """Return the command that draws the map at `out`; a .png of its name may hold its cells and is avoided."""
+    """Return the command that draws the map at `out`; it avoids a .png of that name, which may hold the map's cells."""
     name = f"{out.stem}-picture.png" if out.with_suffix(".png").exists() else f"{out.stem}.png"
     return command_line("picture", out.with_suffix(".yaml"), name)

@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from stereovox.track.gaps import TrackingGap
 
 MAX_SPANS = 10
-"""Spans of lost frames that are printed."""
+"""Most spans of lost frames that are printed."""
 T = TypeVar("T")
 
 
 def say(text: str = "") -> None:
-    """Print one or more lines on stderr, with control characters from names in recordings made harmless."""
+    """Print one or more lines on stderr; control characters, from names in recordings, are escaped."""
     print("\n".join(map(one_line, text.split("\n"))), file=sys.stderr, flush=True)
 
 
 def say_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table and a blank line: columns of numbers to the right, others to the left."""
+    """Print a table and a blank line: columns of numbers right-aligned, others left-aligned."""
     columns = []
     for head, *texts in zip(heads, *rows, strict=True):
         width = max(map(len, (head, *texts)))
@@ -47,7 +47,7 @@ def say_about_compiling() -> bool:
 
     folder = cache_folder()
     if folder is None:
-        say("no folder for compiled kernels can be written: they are compiled in every run (set STEREOVOX_CACHE)")
+        say("no folder for compiled kernels is writable, so every run compiles them (set STEREOVOX_CACHE)")
     elif not any(folder.rglob("*.nbi")):
         say("compiling the kernels, once on this machine: 20 to 40 seconds")
     else:
@@ -57,7 +57,7 @@ def say_about_compiling() -> bool:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Yield a progress bar with rate and remaining time, shown if stderr is a terminal; it disappears at the end."""
+    """Yield a progress bar with rate and remaining time, shown only on a terminal; it disappears at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -107,18 +107,18 @@ class FrameProgress:
         self.advance()
 
     def step(self, done: int, total: int, doing: str) -> None:
-        """Show another step of the work than the frames themselves."""
+        """Show a step of the work that is not a frame."""
         self._bar.update(self._task, completed=done, total=total, description=doing, note="")
 
     def advance(self) -> None:
         """Advance by one step."""
         speed = self._bar.tasks[0].finished_speed or self._bar.tasks[0].speed
-        self._bar.update(self._task, advance=1, note=f"{speed:.0f} a second" if speed else "")
+        self._bar.update(self._task, advance=1, note=f"{speed:.0f} per second" if speed else "")
 
 
 def first_included(result: dict[str, Any]) -> str:
-    """Return a remark on times in a summary if they are those of a single frame, the first; else nothing."""
-    return " (a single frame: loading or compiling the kernels included)" if result["frames"] == 1 else ""
+    """Return a remark on times in a summary if they are from a single frame, the first; else nothing."""
+    return " (a single frame, including loading or compiling the kernels)" if result["frames"] == 1 else ""
 
 
 def milliseconds(figures: dict[str, float]) -> str:
@@ -127,13 +127,13 @@ def milliseconds(figures: dict[str, float]) -> str:
 
 
 def but_few(result: dict[str, Any]) -> str:
-    """Return `, but only ...` for the last line of a command that lost most of what came; else nothing."""
+    """Return `, but only ...` for the last line of a command that lost most of its input; else nothing."""
     lost = [doubt for doubt in result.get("doubts", ()) if isinstance(doubt, dict) and doubt["kind"] == "mostly_lost"]
     return "".join(f", but {doubt['text']}" for doubt in lost)
 
 
 def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:
-    """Print how many `what` (frames) were mapped, which were refused and why, and when they were accepted again."""
+    """Print how many `what` (frames) were mapped, which were refused and why, and how often accepted again."""
     say(f"{result['frames']} {what} mapped, {result['frames_refused']} refused")
     for doubt in result.get("doubts", ()):
         if doubt.get("kind") == "mostly_lost":
@@ -146,16 +146,16 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
 
 
 def say_lost(spans: Sequence[TrackingGap]) -> None:
-    """Print where the camera was lost: the longest spans, in order."""
+    """Print the gaps in tracking: the longest ones, in order."""
     shown = sorted(sorted(spans, key=len)[-MAX_SPANS:], key=lambda span: span.first)
     for span in shown:
         say(f"  {span.line()}")
     if len(spans) > len(shown):
-        say(f"  and {len(spans) - len(shown)} more, which are not longer (all with --json)")
+        say(f"  and {len(spans) - len(shown)} shorter ones (all with --json)")
 
 
 def cells_line(result: dict[str, Any], voxel_size: float | None = None) -> str:
-    """Format one line about the cells of a map, also their side in metres if it is given, and their memory."""
+    """Format one line about the cells of a map, with their side in metres if given, and their memory."""
     occupied, free = thousands(result["occupied"]), thousands(result["free"])
     reserved = ", reserved for the window" if result.get("memory_reserved") else ""
     side = "" if voxel_size is None else f" of {voxel_size:g} m"

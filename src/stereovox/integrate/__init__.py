@@ -21,7 +21,7 @@ INTEGRATORS = {
     "line": "stereovox.integrate.ray:Line",
 }
 DEVICES = {"cpu": INTEGRATORS, "cuda": {"projective": "stereovox.integrate.gpu:GpuProjective"}}
-"""The integrators of each device; only those of the processor can come from other packages."""
+"""The integrators of each device; only processor ones can come from other packages."""
 
 
 class Integrator(Protocol):
@@ -43,7 +43,7 @@ class Integrator(Protocol):
 
 
 class Integration:
-    """Evidence of all kinds of images: depth images by the configured integrator, clouds by `Points`."""
+    """Makes evidence from all kinds of images: depth images by the configured integrator, clouds by `Points`."""
 
     def __init__(self, config: Config):
         self._config, self._images = config, make_integrator(config)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of scan beams: their lines, and the cells those cross.
+"""Kernels of scan beams: their lines, and the cells that these cross.
 
-Unlike elsewhere numbers are float64: beams are walked one by one, so wide registers gain nothing, and far from the
-origin cells keep their edges. Places are in cells, whole multiples of 2^-20, so that differences are exact.
+Unlike elsewhere, numbers are float64: beams are walked one by one, so wide registers gain nothing, and cells far from
+the origin keep their edges. Positions are in cells, multiples of 2^-20, so that differences are exact.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from stereovox.kernels._jit import allocating_kernel, cell, kernel
 
 UNSIGNED = np.uint64
-"""Kind of index without the test for negative indices."""
+"""Index type that avoids the test for negative indices."""
 GRAIN = 2.0**20
 """Coordinates are multiples of 1 / GRAIN cells."""
 ZERO = np.float32(0)
@@ -20,12 +20,12 @@ POINT = 48
 ONE = 2.0**POINT
 """Lines run in fixed point with POINT fractional bits: after 4,096 cells they are off by 2^-36."""
 CORNER = 1 << (POINT - 35)
-"""A line that passes a corner of cells this closely touches two of its four cells."""
+"""A line that passes a corner of cells this closely touches two of the four cells."""
 
 
 @cell
 def _grain(place):
-    """Return a place rounded to the grain that all places are multiples of."""
+    """Return a coordinate rounded to a multiple of 1 / GRAIN."""
     return np.rint(place * GRAIN) / GRAIN
 
 
@@ -34,11 +34,10 @@ def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, f
     """Write where beams clear and where they hit, as lines (n, 4) from x, y to x, y in cells; return how many of each.
 
     directions: (N, 2) cosines and sines in the sensor's frame. turn: (2, 2) from there to cells. position: (2,) of the
-    sensor in cells. limits: (3,) float32 nearest range that counts, farthest that does, farthest the sensor measures.
-    clear: (N,), or empty where ranges alone tell; clear_from: (N,), or empty if it is from the sensor on.
-    taken_back: points in cells that are hit and that the line before clears. reads: (N, 6) of each beam from where and
-    up to where it clears, and where it hits; NaN for nothing. box: (4,) lowest column and row, highest column and row
-    of all.
+    sensor in cells. limits: (3,) float32 nearest range that counts, farthest that counts, farthest that the sensor
+    measures. clear: (N,), or empty if ranges alone decide; clear_from: (N,), or empty for the sensor.
+    taken_back: points in cells that a beam both clears and hits. reads: (N, 6) start and end of the cleared part of
+    each beam, and its hit; NaN for none. box: (4,) lowest column and row, highest column and row of all.
     """
     nearest, reach, farthest = limits[0], limits[1], limits[2]
     x, y = _grain(position[0]), _grain(position[1])
@@ -84,7 +83,7 @@ def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, f
 
 @kernel
 def lay_out(first, across, coords, values):
-    """Empty the tiles `values` (n, 4096) of a patch that is `across` tiles wide from tile `first` on; name them."""
+    """Zero the tiles `values` (n, 4096) of a patch, `across` tiles wide from tile `first` on; write their `coords`."""
     for i in range(coords.shape[0]):
         coords[i, 0] = first[0] + i % across
         coords[i, 1] = first[1] + i // across
@@ -94,7 +93,7 @@ def lay_out(first, across, coords, values):
 
 @cell
 def _give(values, place, gain, adding):
-    """Add `gain` to a cell, or where `adding` is None let the cell have nothing else."""
+    """Add `gain` to a cell, or set the cell to it if `adding` is None."""
     if adding is None:
         values[place] = gain
     else:
@@ -103,7 +102,7 @@ def _give(values, place, gain, adding):
 
 @cell
 def _give_twice(values, place, other, gain, adding):
-    """Give `gain` to two cells, which may be the same: once then."""
+    """Give `gain` to two cells; only once if they are the same."""
     if adding is None:
         values[place] = gain
         values[other] = gain
@@ -114,7 +113,7 @@ def _give_twice(values, place, other, gain, adding):
 
 @allocating_kernel
 def places(across, up):
-    """Return how far into a patch of tiles each of its columns lies, and each row: their sum is a cell's place."""
+    """Return the offset of each column and of each row in a patch of tiles: their sum is the index of a cell."""
     columns, rows = np.empty(across << SIDE_BITS, np.uint32), np.empty(up << SIDE_BITS, np.uint32)
     for x in range(columns.size):
         columns[x] = ((x >> SIDE_BITS) << 2 * SIDE_BITS) + (x & SIDE - 1)
@@ -127,8 +126,8 @@ def places(across, up):
 def exact(lines, first, columns, rows, gain, adding, values):
     """Give `gain` to every cell that lines (n, 4) touch (the cells of Amanatides and Woo 1987).
 
-    values: the cells of a patch of tiles, one after the other. first: (2,) its lowest column and row. columns, rows:
-    see `places`. adding: 1 adds to what a cell has, None replaces it.
+    values: the cells of a patch of tiles, in order. first: (2,) its lowest column and row. columns, rows: see `places`.
+    adding: 1 adds to the value of a cell, None replaces it.
     """
     left, bottom = float(first[0]), float(first[1])
     for n in range(lines.shape[0]):
@@ -145,7 +144,7 @@ def exact(lines, first, columns, rows, gain, adding, values):
         corner = CORNER if slope > 0 else -CORNER if slope < 0 else 0
         lowest = int(min(v0, v1))
         enters = aside[int(v0)]
-        for i in range(begin, last):  # one layer of cells: from where the line enters it to where it leaves
+        for i in range(begin, last):  # one layer of cells, from the line's entry to its exit
             place, leaves = along[UNSIGNED(i)], aside[UNSIGNED((v - corner) >> POINT)]
             _give_twice(values, place + enters, place + leaves, gain, adding)
             enters = aside[UNSIGNED(max((v + corner) >> POINT, lowest))]
@@ -155,9 +154,9 @@ def exact(lines, first, columns, rows, gain, adding, values):
 
 @kernel
 def bresenham(lines, first, columns, rows, gain, adding, values):
-    """Give `gain` to the cells of Bresenham's lines between the cells that lines (n, 4) begin and end in.
+    """Give `gain` to the cells of Bresenham's lines between the cells in which lines (n, 4) begin and end.
 
-    Arguments as in `exact`. A line from the sensor's cell (IST 2019, II-B); a tie stays on the near side.
+    Arguments as in `exact`. Lines start at the sensor's cell (IST 2019, II-B); ties stay on the near side.
     """
     left, bottom = float(first[0]), float(first[1])
     for n in range(lines.shape[0]):

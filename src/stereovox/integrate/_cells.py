@@ -7,7 +7,7 @@ from stereovox.kernels._jit import cell, kernel
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 NARROW, WIDE = 10, 20
-"""Bits of each cell coordinate in a key of 32 and of 64 bits."""
+"""Bits per cell coordinate in a key of 32 and of 64 bits."""
 NEAR_PLANE = np.float32(1e-3)
 """Cells with centres at a depth below this (metres) are skipped."""
 NO_RETURN = np.float32(1e6)
@@ -18,9 +18,9 @@ NO_RETURN = np.float32(1e6)
 def aim(T_world_camera, cell, side, intrinsics, size, rim, centres, block, rotation, forward, position, sides, steps):
     """Fill block, rotation, forward, position, sides and steps of a `View` for the pose (4, 4).
 
-    cell: (3,) sides of a cell in metres; where they differ, the world is stretched to make cells cubes of `side`.
+    cell: (3,) sides of a cell in metres; if they differ, the world is stretched to make cells cubes of `side`.
     intrinsics: fx, fy, cx, cy. size: (2,) width, height. rim: (2,) pixels times depth. centres: (3, 512) of the cells
-    of a block, in cells. block: (3,) int32, that the camera stands in, of 8 cells a side.
+    of a block, in cells. block: (3,) int32, the camera's block of 8x8x8 cells.
     """
     for a in range(3):
         block[a] = np.int32(np.floor(T_world_camera[a, 3] / (8 * cell[a])))
@@ -29,7 +29,7 @@ def aim(T_world_camera, cell, side, intrinsics, size, rim, centres, block, rotat
         for b in range(3):
             rotation[b, a] = T_world_camera[a, b] / stretch
             forward[b, a] = T_world_camera[a, b] * stretch
-    for s in range(4):  # seen: fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides
+    for s in range(4):  # seen: fx x + (cx + 0.5) z + rim >= 0, and likewise for the other three sides
         axis, sign = s >> 1, 1.0 - 2.0 * (s & 1)
         focal, centre = intrinsics[axis], intrinsics[2 + axis]
         room = centre + 0.5 if sign > 0 else size[axis] - 0.5 - centre
@@ -52,13 +52,13 @@ def aim(T_world_camera, cell, side, intrinsics, size, rim, centres, block, rotat
 
 @cell
 def bits(keys):
-    """Return the bits of each cell coordinate in keys of this kind."""
+    """Return the bits per cell coordinate in keys of this type."""
     return NARROW if np.iinfo(keys.dtype).bits == 32 else WIDE
 
 
 @cell
 def pack(x, y, z, keys):
-    """Return the key of a cell, of the kind that `keys` holds; negative coordinates down to half the range fit."""
+    """Return the key of a cell, of the type of `keys`; negative coordinates down to half the range fit."""
     kind = keys.dtype.type
     b = kind(bits(keys))
     half = kind(1) << (b - kind(1))
@@ -67,14 +67,14 @@ def pack(x, y, z, keys):
 
 @cell
 def unpack(key, b):
-    """Return the cell that a key with `b` bits a coordinate (int64) stands for."""
+    """Return the cell of a key with `b` bits per coordinate (int64)."""
     k, half, mask = np.int64(key), np.int64(1) << (b - 1), (np.int64(1) << b) - 1
     return np.int32((k >> (2 * b)) - half), np.int32(((k >> b) & mask) - half), np.int32((k & mask) - half)
 
 
 @cell
 def strides(signs, keys):
-    """Return what one step along x, y and z, forth (sign > 0) or back, adds to a key of the kind that `keys` holds."""
+    """Return the changes of a key, of the type of `keys`, by one step forth (sign > 0) or back along x, y and z."""
     kind = keys.dtype.type
     b = kind(bits(keys))
     x, y = kind(1) << (b + b), kind(1) << b
@@ -87,7 +87,7 @@ def strides(signs, keys):
 
 @cell
 def stronger(old, new):
-    """Return the stronger evidence on one cell: positive beats negative, then the larger amount wins."""
+    """Return the stronger evidence on one cell: positive beats negative, then the larger magnitude wins."""
     if new > 0:
         return max(old, new)
     return old if old > 0 else min(old, new)
@@ -101,7 +101,7 @@ def table_row(depth, rows_per_metre, rows):
 
 @cell
 def usable(depth):
-    """Return a REP 117 depth as a plain number: no value (NaN, too near) is 0, too far NO_RETURN."""
+    """Return a REP 117 depth as a plain number: no value (NaN, too near) is 0, too far is NO_RETURN."""
     positive = depth if depth > ZERO else ZERO
     return positive if positive < NO_RETURN else NO_RETURN
 

@@ -8,10 +8,10 @@ from stereovox.kernels._jit import allocating_kernel
 
 @allocating_kernel
 def walk(origin, ends, first, steps, cells):
-    """Write the cells of each ray, from that of `origin` (3,) to that of its end; all places are in cells.
+    """Write the cells of each ray, from the cell of `origin` (3,) to the cell of its end; coordinates are in cells.
 
-    ends: (N, 3). first: (N,) int64, row of `cells` of each ray's first cell. steps: (N,) int64 faces that each crosses.
-    cells: (M, 3) int64.
+    ends: (N, 3). first: (N,) int64, row of `cells` of each ray's first cell. steps: (N,) int64, number of faces that
+    each crosses. cells: (M, 3) int64.
     """
     per_cell, next_face = np.empty(3), np.empty(3)
     at, step = np.empty(3, np.int64), np.empty(3, np.int64)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the projective integrator on a graphics card: loops over the cells of `_projective.py` and `_hits.py`.
+"""Kernels of the projective integrator on a graphics card: loops over the functions of `_projective.py` and `_hits.py`.
 
-Everything between the depth image and the evidence stays on the card, also how many blocks there are of each kind.
-Where a list is too short, its number goes on counting and the rest is not written; the caller looks at the numbers at
-the end, makes room, and does the frame again. The order of lists differs from run to run; what is in them does not.
+Everything between the depth image and the evidence stays on the card, including the number of blocks of each kind. If
+a list is too short, counting continues but the rest is not written; the caller checks the counts at the end, makes room
+and repeats the frame. The order of lists differs from run to run; their contents do not.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ LARGE, MIDDLE, SEEN_FREE, SEEN_MIXED, FREE_BLOCKS, LISTED, HIT_BLOCKS = 0, 1, 2,
 blocks without hits, cells with hits, and blocks with hits."""
 COUNTS = 7
 NARROW_BLOCK, WIDE_BLOCK = (~np.int64((7 << 2 * bits) | (7 << bits) | 7) for bits in (NARROW, WIDE))
-"""Masks that make the key of a cell the key of its block's first cell."""
+"""Masks that turn the key of a cell into the key of its block's first cell."""
 MIXER = np.uint64(0x9E3779B97F4A7C15)
 
 place, usable, unpack = on_gpu(_windows.place), on_gpu(_cells.usable), on_gpu(_cells.unpack)
@@ -53,7 +53,7 @@ find, home_slot = on_gpu(_map_cells.find), on_gpu(_map_cells.home_slot)
 def shrink(depth_m, base, windows, level):
     """Fill `level` of `base`, from 1 on: how far one sees through each tile of 2^(level - 1) pixels; see `_windows`.
 
-    depth_m: flat REP 117 depth image. base: like `windows.image`; the level before is filled.
+    depth_m: flat REP 117 depth image. base: like `windows.image`; the previous level is filled.
     """
     shape, pitch, height = windows.shape, windows.pitch, windows.height
     rows, columns = shape[level, 0], shape[level, 1]
@@ -77,7 +77,7 @@ def shrink(depth_m, base, windows, level):
 
 @gpu_kernel
 def widen(base, windows):
-    """Fill the window images of all levels from `windows.first` on: at each pixel of `base` the farthest of 3x3."""
+    """Fill the window images of all levels from `windows.first` on: for each pixel of `base` the farthest of 3x3."""
     for level in range(windows.first, COARSEST + 1):
         rows, columns = windows.shape[level, 0], windows.shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, windows.pitch, windows.height)
@@ -128,7 +128,7 @@ def join_tiles(windows):
 
 @gpu_kernel
 def nearest_tiles(depth_m, height, width, size, tiles):
-    """Fill `tiles` of `size` pixels with the nearest depth in them, pixels without value left out."""
+    """Fill `tiles` of `size` pixels with their nearest depth, ignoring pixels without value."""
     across = tiles.shape[1]
     for i in range(cuda.grid(1), tiles.size, cuda.gridsize(1)):
         v, u = size * (i // across), size * (i % across)
@@ -142,7 +142,7 @@ def nearest_tiles(depth_m, height, width, size, tiles):
 
 @gpu_kernel
 def find_boxes(view, table, windows, boxes):
-    """Write the first coarse box along each axis, and how many there are, to `boxes` (3, 2) int32."""
+    """Write the first coarse box along each axis, and the number of boxes, to `boxes` (3, 2) int32."""
     if cuda.grid(1) == 0:
         end = end_of_view(view, table, view.max_range if table.marks else farthest_of(windows))
         for axis in range(3):
@@ -152,7 +152,7 @@ def find_boxes(view, table, windows, boxes):
 
 @gpu_kernel
 def cull_coarse(view, table, windows, nearest, boxes, free, mixed, counts):
-    """Classify all coarse boxes: list the blocks of those that are free, and in `mixed` (room, 3) the mixed ones."""
+    """Classify all coarse boxes: list the blocks of free ones, and in `mixed` (room, 3) the mixed boxes."""
     nx, ny, nz = boxes[0, 1], boxes[1, 1], boxes[2, 1]
     for i in range(cuda.grid(1), nx * ny * nz, cuda.gridsize(1)):
         x = boxes[0, 0] + COARSE * (i // (ny * nz))
@@ -173,7 +173,7 @@ def cull_coarse(view, table, windows, nearest, boxes, free, mixed, counts):
 def cull(view, table, windows, nearest, larger, counted, half, free, mixed, listed, counts):
     """Classify the eight parts, `half` blocks wide, of each of the `larger` boxes, as `cull_coarse` does.
 
-    counted, listed: where in `counts` stands how many `larger` and `mixed` boxes there are.
+    counted, listed: indices into `counts` of the numbers of `larger` and `mixed` boxes.
     """
     parts = 8 * min(counts[counted], larger.shape[0])
     volume = half * half * half
@@ -197,8 +197,8 @@ def cull(view, table, windows, nearest, larger, counted, half, free, mixed, list
 def list_cells(depth_m, view, wide, claims, listed, counts):
     """List the keys of all cells that hold a measured point, each once.
 
-    depth_m: flat REP 117 depth image. wide: whether keys need 64 bits. claims: hash of NOTHING, a power of two. listed:
-    (pixels,) int64.
+    depth_m: flat REP 117 depth image. wide: whether keys need 64 bits. claims: hash filled with NOTHING, its size a
+    power of two. listed: (pixels,) int64.
     """
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
@@ -247,7 +247,7 @@ def list_blocks(listed, wide, claims, coords, counts):
 
 @gpu_kernel
 def enter_blocks(table, coords, values, taken, counts):
-    """Enter the blocks with hits into an empty hash table, their rows of `values` (room, 512) without hits so far."""
+    """Enter the blocks with hits into an empty hash table, and zero their rows of `values` (room, 512)."""
     n = min(counts[HIT_BLOCKS], coords.shape[0])
     for i in range(cuda.grid(1), n, cuda.gridsize(1)):
         slot = home_slot(coords[i, 0], coords[i, 1], coords[i, 2], table.size - 1)
@@ -292,7 +292,7 @@ def weigh(depth_m, view, table, full_share, listed, wide, hit_table, coords, val
 
 @gpu_kernel
 def match_hits(hit_table, hit_coords, mixed, hit_of, taken, counts):
-    """Write the place of each mixed block among the hits, -1 for none, and mark the hits that are `taken`."""
+    """Write the index of each mixed block among the hits, -1 for none, and mark those hits as `taken`."""
     for i in range(cuda.grid(1), min(counts[SEEN_MIXED], mixed.shape[0]), cuda.gridsize(1)):
         h = find(hit_table, hit_coords, mixed[i, 0], mixed[i, 1], mixed[i, 2])
         hit_of[i] = h
@@ -302,7 +302,7 @@ def match_hits(hit_table, hit_coords, mixed, hit_of, taken, counts):
 
 @gpu_kernel
 def append_hits(hit_coords, mixed, hit_of, taken, counts):
-    """Put the blocks with hits that are not `taken` among the mixed ones."""
+    """Append the blocks with hits that are not `taken` to the mixed ones."""
     for h in range(cuda.grid(1), min(counts[HIT_BLOCKS], hit_coords.shape[0]), cuda.gridsize(1)):
         if taken[h] == 0:
             n = cuda.atomic.add(counts, SEEN_MIXED, 1)
@@ -315,8 +315,8 @@ def append_hits(hit_coords, mixed, hit_of, taken, counts):
 def evaluate(depth_m, view, table, windows, origin, mixed, hit_of, hits, counts, coords, values, said):
     """Write the evidence on the cells of the mixed blocks, hits included, to `values` (room, 512) int16.
 
-    depth_m: (h, w) REP 117 depth image. origin: the block that blocks count from. coords: written, counted from the
-    world's origin. said: written, (room,) int16, 1 where a block's values are not all 0.
+    depth_m: (h, w) REP 117 depth image. origin: the block that block coordinates count from. coords: written, counted
+    from the world's origin. said: written, (room,) int16, 1 for blocks whose values are not all 0.
     """
     for i in range(cuda.blockIdx.x, min(counts[SEEN_MIXED], mixed.shape[0]), cuda.gridDim.x):
         cx, cy, cz = corner(view, mixed[i, 0], mixed[i, 1], mixed[i, 2])
@@ -345,7 +345,7 @@ def evaluate(depth_m, view, table, windows, origin, mixed, hit_of, hits, counts,
 
 @gpu_kernel
 def passed(view, table, origin, hit_table, hit_coords, free, counts, coords, steps):
-    """List the free blocks without hits, counted from the world's origin, and what all cells of each get."""
+    """List the free blocks without hits, counted from the world's origin, and the evidence on all cells of each."""
     for i in range(cuda.grid(1), min(counts[SEEN_FREE], free.shape[0]), cuda.gridsize(1)):
         x, y, z = free[i, 0], free[i, 1], free[i, 2]
         if find(hit_table, hit_coords, x, y, z) < 0:
@@ -357,7 +357,7 @@ def passed(view, table, origin, hit_table, hit_coords, free, counts, coords, ste
 
 @gpu_kernel
 def reset(claims, block_claims, hit_table, counts):
-    """Forget what the frame before has left."""
+    """Clear the remains of the previous frame."""
     for i in range(cuda.grid(1), claims.size, cuda.gridsize(1)):
         claims[i] = block_claims[i] = NOTHING
     for i in range(cuda.grid(1), hit_table.size, cuda.gridsize(1)):

@@ -2,7 +2,7 @@
 """Kernels that scatter measured points into their cells, and weigh each hit by its share of the cell's footprint.
 
 Most pixels fall into the cell of their left or upper neighbour. Each pixel's cell is packed into one number, and only
-pixels whose number differs from their neighbours' go on; groups without any cost one test.
+pixels whose number differs from their neighbours' are processed; groups without any cost one test.
 """
 
 import numpy as np
@@ -31,17 +31,17 @@ GROUP = 8
 NOTHING = -1
 """Key of a pixel without a measurement."""
 SIDE_SAMPLES = 4
-"""Samples along each side of a cell's footprint, at most."""
+"""Most samples along each side of a cell's footprint."""
 LANES = 64
 """Cells that are weighed together."""
 
 
 @kernel
 def scatter(depth_m, view, scratch, listed, pool_table, coords, count, values):
-    """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
+    """Set every cell that holds a measured point to 1; return how many there are, -1 if the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. scratch: `HitScratch`. Blocks count from the camera's own.
-    listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
+    depth_m: (h, w) REP 117 depth image. scratch: `HitScratch`. Block coordinates count from the camera's block.
+    listed: (pixels,) int32, written: the cells that were set, as 512 * index of the block in the pool + cell in it.
     """
     keys, news, fresh, seen = scratch
     size = np.float32(1) / view.voxel_size
@@ -80,10 +80,10 @@ def scatter(depth_m, view, scratch, listed, pool_table, coords, count, values):
 
 @kernel
 def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
-    """Replace the ones that `scatter` set by evidence: that of a hit at the depth of the cell's centre.
+    """Replace the ones that `scatter` set by the evidence of a hit at the depth of the cell's centre.
 
-    It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
-    with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
+    A hit counts in full if at least `full_share` of the cell's footprint in the image measures a depth within the cell;
+    else by the square root of the ratio: a few pixels may be a matching error. full_share 0: always in full.
     listed: (n,) cells that `scatter` set. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
@@ -99,10 +99,10 @@ def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
 
 @cell
 def _centres(view, coords, listed, lanes):
-    """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
+    """Write the centres of listed cells in camera axes, x and y times the focal length."""
     x, y, z, px, py, pz = lanes.x, lanes.y, lanes.z, lanes.u, lanes.v, lanes.step
     n = listed.size
-    for i in range(n):  # by itself: see `_projective._aim`
+    for i in range(n):  # a loop of its own: see `_projective._aim`
         block, c = np.uint32(listed[i] >> 9), np.uint32(listed[i] & 511)
         px[i] = np.float32(coords[block, 0])
         py[i] = np.float32(coords[block, 1])
@@ -114,7 +114,7 @@ def _centres(view, coords, listed, lanes):
 
 @cell
 def centre(view, bx, by, bz, x_step, y_step, z_step):
-    """Return where the centre of a cell stands, camera axes, x and y times the focal length.
+    """Return the centre of a cell in camera axes, x and y times the focal length.
 
     All float32: the block's coordinates, and the cell's entries of `view.steps`.
     """
@@ -128,14 +128,14 @@ def centre(view, bx, by, bz, x_step, y_step, z_step):
 
 @cell
 def _share(depth_m, view, n, lanes):
-    """Write the part of each cell's footprint whose pixels measure a depth within half a cell of its centre.
+    """Write the share of each cell's footprint whose pixels measure a depth within half a cell of its centre.
 
-    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts.
+    Samples are evenly spaced, up to SIDE_SAMPLES per side; at least half a sample counts.
     """
     x, y, z, share, u, v, samples, step, looked, depth, counts, at = lanes
     limit = HALF * view.voxel_size
     most = np.int32(1)
-    for i in range(n):  # `_gpu.weigh` has the same lines: in a cell they would be rounded otherwise, and maps change
+    for i in range(n):  # `_gpu.weigh` repeats these lines: a shared cell would round differently, and change maps
         inverse = ONE / z[i]
         wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
         samples[i] = samples_across(wide)
@@ -153,7 +153,7 @@ def _share(depth_m, view, n, lanes):
             for i in range(n):
                 counts[i], at[i] = sample(view, u[i] + column * step[i], v[i] + row * step[i])
                 counts[i] = counts[i] if (row < samples[i]) & (column < samples[i]) else ZERO
-            for i in range(n):  # by itself: see `_projective._aim`
+            for i in range(n):  # a loop of its own: see `_projective._aim`
                 depth[i] = depth_m[index(at[i])]
             for i in range(n):
                 share[i] += counts[i] if abs(depth[i] - z[i]) <= limit else ZERO
@@ -164,13 +164,13 @@ def _share(depth_m, view, n, lanes):
 
 @cell
 def samples_across(wide):
-    """Return how many samples are taken along each side of a footprint `wide` pixels wide, a float32."""
+    """Return the number of samples along each side of a footprint `wide` pixels wide, a float32."""
     return np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
 
 
 @cell
 def sample(view, u, v):
-    """Return whether a point lies in the image, 1 or 0, and the number of its pixel, 0 if it does not."""
+    """Return whether a point is in the image, 1 or 0, and the index of its pixel, 0 if it is not."""
     inside = (u >= ZERO) & (u < np.float32(view.width)) & (v >= ZERO) & (v < np.float32(view.height))
     at = np.int32(np.int32(v if inside else ZERO) * view.width) + np.int32(u if inside else ZERO)
     return ONE if inside else ZERO, np.int32(at)
@@ -178,7 +178,7 @@ def sample(view, u, v):
 
 @cell
 def share_of(share, looked):
-    """Return the part of a footprint whose samples measure the cell: so many of those that were looked at."""
+    """Return the share of a footprint: samples that measure the cell, of all `looked` samples in the image."""
     return max(share, HALF) / max(looked, ONE)
 
 
@@ -204,7 +204,7 @@ def hit_row(view, table, z):
 
 @cell
 def weighed_hit(hit, full_share, share):
-    """Return the evidence of a hit (float32) on a cell of whose footprint a `share` measures it."""
+    """Return the evidence of a hit (float32) on a cell that a `share` of its footprint measures."""
     part = min(ONE, share / full_share) if full_share > ZERO else ONE
     weighed = max(floor(hit * square_root(part) + HALF), ONE)
     return np.int32(weighed if hit > ZERO else ZERO)
@@ -219,7 +219,7 @@ def _slot(key):
 
 @cell
 def _row_rays(forward, row, size):
-    """Return, in cells, how the world point of a pixel of this row at depth 1 depends on its column: slope, offset.
+    """Return slope and offset, in cells, of the world point at depth 1 as a function of the column of this row.
 
     row: (2,) y and z of the row's rays at depth 1; see `stereovox.cameras.pinhole`.
     """
@@ -245,7 +245,7 @@ def _point_cell(d, column, ray, position):
 def _narrow_row(depths, columns, ray, position, now, before, news):
     """Pack each pixel's cell into an int32 and mark news.
 
-    Offsets keep all numbers positive, so that cutting off digits is the floor.
+    Offsets keep all numbers positive, so that truncation is the floor.
     """
     offset = narrow_offset(position)
     last = np.int32(NOTHING)
@@ -295,10 +295,10 @@ def wide_key(d, column, ray, position):
 
 @cell
 def _is_new(key, left, above, above_right):
-    """Return whether a pixel holds a measurement whose cell none of three earlier pixels has.
+    """Return whether a pixel holds a measurement in a cell that none of three earlier pixels has.
 
-    Noise makes the pixels of a surface near a cell's face fall into two cells by turns; these three were found to be
-    worth their comparisons, further ones not.
+    Noise makes pixels of a surface near a cell's face alternate between two cells; these three comparisons pay off,
+    further ones do not.
     """
     return np.uint8((key != left) & (key != above) & (key != above_right) & (key != NOTHING))
 

@@ -28,21 +28,21 @@ from stereovox.maps.cells._cells import find_or_insert
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""
 GROUP_BITS = 3
-"""Binary logarithm of the lanes whose gains are summed one after the other."""
+"""Binary logarithm of the number of lanes whose gains are summed sequentially."""
 MEMORY_BITS = 9
-"""Binary logarithm of the blocks whose places are cached next to the pool's hash: 8 along each axis."""
+"""Binary logarithm of the number of blocks cached in front of the pool's hash: 8 along each axis."""
 NOWHERE = np.float32(-1e30)
-"""In place of the depth of a cell that a lane says nothing about."""
+"""Stands for the depth of a cell to which a lane gives no evidence."""
 FRACTION_BITS = 10
 """Weighted evidence is summed in units of 2^-10 thousandths: integers, so the order of rays does not matter."""
 FRACTION = np.float32(1 << FRACTION_BITS)
 HALF_DIAGONAL = np.float32(0.8661)
-"""Depth, in cells, from where a ray enters a cell to the middle of its way through it, at most."""
+"""Largest depth, in cells, from a ray's entry into a cell to the middle of its path through it."""
 
 
 @cell
 def in_step(columns, ray):
-    """Return how many of the columns' rays share their direction along each axis, and its signs along x, y and z."""
+    """Return how many of the columns' rays agree in direction along each axis, and the signs along x, y and z."""
     signs = _signs(ray, columns[0])
     n = columns.size
     while _signs(ray, columns[n - 1]) != signs:  # directions change evenly from column to column
@@ -62,7 +62,7 @@ def _sign(direction):
 
 @cell
 def even_to(table, view):
-    """Return the depth up to which cells may begin whose passed loss is `table.free` for certain."""
+    """Return the depth up to which cells may begin whose passed loss is certainly `table.free`."""
     row = 0
     while row < table.passed.size and table.passed[row] == table.free:
         row += 1
@@ -74,7 +74,7 @@ def even_to(table, view):
 def aim(depths, columns, ray, position, view, table, lanes):
     """Fill column, depth, end, row, columns and hit of the lanes for a run of pixels.
 
-    Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
+    Return the depth up to which cells may begin that are plainly free for all lanes; NO_RETURN without any ray.
 
     depths, columns: REP 117 depth and x/z of at most LANES pixels of one image row. ray: see `_row_rays`.
     """
@@ -82,7 +82,7 @@ def aim(depths, columns, ray, position, view, table, lanes):
     for i in range(LANES):
         row = np.uint32(lanes.row[i])
         lanes.columns[i], lanes.reach[i] = table.columns_per_metre[row], table.reach[row]
-    nearest = bits_of(NO_RETURN)  # whole numbers: those can be compared many at once
+    nearest = bits_of(NO_RETURN)  # integers, whose comparisons vectorise
     half_cell = HALF_DIAGONAL * view.voxel_size  # the cell of the measured point is never "plainly free"
     for i in range(LANES):
         d, reach = lanes.depth[i], lanes.reach[i]
@@ -100,7 +100,7 @@ def aim(depths, columns, ray, position, view, table, lanes):
 
 @cell
 def _take(depths, columns, view, table, lanes):
-    """Fill depth, row and column of the lanes. Those left over go along with the last pixel, and end at once."""
+    """Fill depth, row and column of the lanes. Spare lanes copy the last pixel, and end at once."""
     n = depths.size
     for i in range(n):
         d = usable(depths[i])
@@ -112,9 +112,9 @@ def _take(depths, columns, view, table, lanes):
 
 @cell
 def free_space(lanes, table, weight):
-    """Take the evidence of all lanes, none near its measurement nor where `table.passed` changes.
+    """Set the evidence of all lanes, none of them near its measurement or where `table.passed` changes.
 
-    Return its sum, and as bits which lanes take other evidence than the one before, where `weight` is None.
+    Return its sum, and, if `weight` is None, as bits which lanes differ in evidence from the previous one.
     """
     total, unlike, before = np.int32(0), np.int32(0), table.free
     for i in range(LANES):
@@ -130,10 +130,10 @@ def free_space(lanes, table, weight):
 
 @cell
 def evidence(lanes, look_up, table, weight):
-    """Take the evidence of all lanes at `middle`, weighted unless `weight` is None; return as `free_space` does.
+    """Set the evidence of all lanes at `middle`, weighted unless `weight` is None; return as `free_space` does.
 
-    look_up: the sensor table (rows * width,), negative and positive evidence together. Places in tables first, then
-    what stands there, then arithmetic: most processors have no vectors for all three at once.
+    look_up: the sensor table (rows * width,), negative and positive evidence together. Table indices first, then the
+    loads, then arithmetic: most processors cannot vectorise all three at once.
     """
     width = np.int32(table.clear.shape[1])
     half, last_column = np.float32(width) * HALF, np.float32(width) - ONE
@@ -163,7 +163,7 @@ def evidence(lanes, look_up, table, weight):
 
 @cell
 def weighted(e, depth, weight):
-    """Return evidence times min(1, weight depth^2) (Chien 2020, Eq 3.21) in 1/1024; as it is where weight is None."""
+    """Return evidence times min(1, weight depth^2) (Chien 2020, Eq 3.21) in 1/1024; unchanged if weight is None."""
     if weight is None:
         return e
     share = min(ONE, weight * depth * depth) * FRACTION
@@ -172,7 +172,7 @@ def weighted(e, depth, weight):
 
 @cell
 def aim_at_hits(lanes, table, weight):
-    """Select the measured points' cells to be given evidence; return starts and total for `give`."""
+    """Select the cells of measured points for `give`; return its starts and total."""
     for i in range(LANES):
         lanes.gain[i] = table.hit[np.uint32(lanes.row[i])]
     total, starts, before, other = np.int32(0), np.int32(0), lanes.hit[0], np.int32(0)
@@ -188,16 +188,16 @@ def aim_at_hits(lanes, table, weight):
 
 @cell
 def bit_if(differs, bit):
-    """Return `bit` if something differs, 0 elsewhere; no branch, which some processors have no vectors for."""
+    """Return `bit` if `differs`, else 0; without a branch, which some processors cannot vectorise."""
     return np.int32(bit & np.int32(-np.int32(differs)))
 
 
 @cell
 def give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
-    """Give the gains of all lanes to their cells; return False when the block pool is full.
+    """Give the gains of all lanes to their cells; return False if the block pool is full.
 
-    starts: lanes with another cell than the one before, a bit each; the first says nothing. total: of all gains.
-    weight: gains of one cell add up; None: the strongest counts, and other gains start a run as well.
+    starts: bits of the lanes whose cell differs from the previous one; the first bit is ignored. total: of all gains.
+    weight: gains of one cell add up; None: the strongest counts, and a different gain starts a run too.
     """
     b = np.int64(bits(lanes.key))
     rest = np.int64(starts) & np.int64(0xFFFFFFFE)
@@ -207,7 +207,7 @@ def give(lanes, starts, total, weight, memory, pool_table, coords, count, values
     while rest != 0:
         low = rest & -rest
         rest ^= low
-        following = np.uint32((bits_of(np.float32(low)) >> np.int32(23)) - np.int32(127))  # the exponent: its place
+        following = np.uint32((bits_of(np.float32(low)) >> np.int32(23)) - np.int32(127))  # the exponent: its index
         if weight is None:
             gain = lanes.gain[at]
         else:
@@ -222,9 +222,9 @@ def give(lanes, starts, total, weight, memory, pool_table, coords, count, values
 
 @cell
 def _add_up(lanes):
-    """Sum the gains of the lanes before each one: those `within` its group, and all of earlier `groups`."""
+    """Sum the gains of all lanes before each one: `within` its group, and over earlier `groups`."""
     total = np.int32(0)
-    for g in range(LANES >> GROUP_BITS):  # short chains, which the processor follows at the same time
+    for g in range(LANES >> GROUP_BITS):  # short chains, which the processor runs in parallel
         lanes.groups[g], within = total, np.int32(0)
         for i in range(g << GROUP_BITS, (g + 1) << GROUP_BITS):
             lanes.within[i] = within
@@ -234,7 +234,7 @@ def _add_up(lanes):
 
 @cell
 def _enter(key, b, gain, weight, memory, pool_table, coords, count, values):
-    """Give evidence to the cell with this key of `b` bits an axis; return False when the block pool is full."""
+    """Give evidence to the cell with this key of `b` bits per axis; return False if the block pool is full."""
     if gain == 0:
         return True
     x, y, z = unpack(key, b)

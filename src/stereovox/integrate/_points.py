@@ -12,11 +12,11 @@ from stereovox.kernels._math import floor
 
 @kernel
 def cast(rays, runs, places, view, table, look_up, lanes, memory, pool_table, coords, count, values, first, step):
-    """Add the evidence of rays to an empty pool, the strongest in each cell; return False when it is too small.
+    """Add the evidence of rays to an empty pool, the strongest in each cell; return False if it is too small.
 
-    rays: (5, N) direction in cells a metre, metres to the surface (NO_RETURN: none), metres to the ray's end where
-    there is none. runs: (K, 3) rays from, to, of one place and one sign along each axis; and that place's number.
-    places: (P, 3) in cells from the corner of the block they count from. first, step: every `step`-th run.
+    rays: (5, N) direction in cells per metre, metres to the surface (NO_RETURN: none), metres to the end of a ray
+    without one. runs: (K, 3) first ray, end, and place of runs with one place and the same signs along the axes.
+    places: (P, 3) in cells from the corner of the origin block. first, step: every `step`-th run.
     """
     memory.block[:] = -1
     even = even_to(table, view)
@@ -35,13 +35,13 @@ def cast(rays, runs, places, view, table, look_up, lanes, memory, pool_table, co
 
 
 @kernel
-def lay(ends, hits, of_place, places, R, t, cell, max_range, reach, rays, way):
-    """Write the rays of a cloud one behind the other, as `cast` takes them; return how many say something.
+def lay(ends, hits, of_place, places, R, t, cell, max_range, reach, rays, course):
+    """Write the rays of a cloud as `cast` takes them; return how many carry evidence.
 
-    ends (N, 3): in metres along the sensor's axes; R (3, 3), t (3,): into those that places (P, 3) are on, in cells.
-    hits (N,): whether at a surface. of_place (N,): at which place each begins; (0,): all at the first. reach: metres
-    before a surface up to which a ray beyond the range is free. Written: rays (5, N); way (N,): signs along the axes,
-    and the place.
+    ends (N, 3): in metres along the sensor's axes; R (3, 3), t (3,): from there into the axes of places (P, 3), which
+    are in cells. hits (N,): whether at a surface. of_place (N,): the place where each begins; (0,): all at the first.
+    reach: metres before a surface up to which a ray beyond the range is free. Written: rays (5, N); course (N,): signs
+    along the axes, and the place.
     """
     used = 0
     for i in range(ends.shape[0]):
@@ -57,17 +57,16 @@ def lay(ends, hits, of_place, places, R, t, cell, max_range, reach, rays, way):
             continue
         rays[0, used], rays[1, used], rays[2, used] = dx / length, dy / length, dz / length
         rays[3, used], rays[4, used] = length if seen else NO_RETURN, clear
-        way[used] = 8 * p + 4 * (dx >= 0) + 2 * (dy >= 0) + (dz >= 0)
+        course[used] = 8 * p + 4 * (dx >= 0) + 2 * (dy >= 0) + (dz >= 0)
         used += 1
     return used
 
 
 @cell
 def _aim(rays, position, signs, view, table, lanes):
-    """Fill the lanes for a run of rays, in the first cell they cross; those left over go along with the last ray, and
-    end at once.
+    """Fill the lanes for a run of rays, in the first cell they cross; spare lanes copy the last ray, and end at once.
 
-    Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
+    Return the depth up to which cells may begin that are plainly free for all lanes; NO_RETURN without any ray.
     """
     key, x, y, z = first_cell(position, signs, lanes.cell)
     half_cell, nearest = HALF_DIAGONAL * view.voxel_size, bits_of(NO_RETURN)

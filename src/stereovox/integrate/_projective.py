@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of the projective integrator: cull blocks from coarse to fine, and evaluate each cell of those that are left.
+"""Kernels of the projective integrator: cull blocks from coarse to fine, and evaluate each cell of the rest.
 
 Nearly all cells are plain: either free, well before the measurement, or behind it. So a layer of cells is first
 classified by two comparisons, and only a layer with cells near a measurement is looked up in the sensor table.
@@ -18,24 +18,24 @@ SKIP, FREE, MIXED = 0, 1, 2
 SLACK = np.float32(1e-3)
 """Pixels, and share of a depth, by which boxes are enlarged: culling may err only on the safe side."""
 COARSE = 4
-"""Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
+"""Blocks along each side of a coarse box; the level between it and a block has boxes of two blocks."""
 TEN = np.float32(10)
 STACK = 32
 """Most boxes on the stack: eight of each of two sizes."""
 LAYER = 64
 """Cells classified together: one layer of a block."""
 UNSEEN = np.float32(-1e9)
-"""Depth that stands for "no measurement at this cell": every cell lies behind it."""
+"""Depth that stands for "no measurement at this cell": every cell is behind it."""
 
 
 @kernel
 def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, mixed):
-    """Build the window images, and list the blocks that are wholly free and those that must be evaluated cell by cell.
+    """Build the window images, and list the blocks that are wholly free and those to evaluate cell by cell.
 
-    Return both numbers; -1 when a list is too short.
+    Return both numbers; -1 if a list is too short.
 
-    depth_m: (h, w) REP 117 depth image. ends: the same, but for pixels that see nothing: the depth up to which that is
-    so. windows, scratch, nearest: `Windows`, `WindowScratch` and tiles, written. stack: (STACK, 4) int32 scratch.
+    depth_m: (h, w) REP 117 depth image. ends: the same, but for pixels that see nothing, the depth up to which they see
+    nothing. windows, scratch, nearest: `Windows`, `WindowScratch` and tiles, written. stack: (STACK, 4) int32 scratch.
     free, mixed: (capacity, 3) int32, written: block coordinates from the camera's block.
     """
     farthest = build(ends.reshape(ends.size), windows, scratch)
@@ -56,12 +56,12 @@ def _end_of_view(view, table, farthest):
 
 @cell
 def _candidates(view, table, windows, nearest, end, stack, free, mixed):
-    """List the blocks that are wholly free and those that must be evaluated; see `survey`.
+    """List the blocks that are wholly free and those to evaluate; see `survey`.
 
-    end: depth in metres beyond which the image says nothing.
+    end: depth in metres beyond which the image gives no evidence.
     """
     n_free, n_mixed = 0, 0
-    low_x, high_x = _touched(view, end, np.int64(0))  # of one type: literal numbers would each compile it again
+    low_x, high_x = _touched(view, end, np.int64(0))  # all of one type: each literal would compile it again
     low_y, high_y = _touched(view, end, np.int64(1))
     low_z, high_z = _touched(view, end, np.int64(2))
     for bx in range(low_x, high_x + 1, COARSE):
@@ -89,9 +89,9 @@ def _candidates(view, table, windows, nearest, end, stack, free, mixed):
 
 @kernel
 def with_hits(view, table, hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed, free_values):
-    """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
+    """Move all blocks that hold hits to the mixed ones; return the numbers of free and of mixed blocks.
 
-    `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the place of each mixed block among
+    `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the index of each mixed block among
     the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch. free_values: (n_free,) int16, written: the evidence
     on all cells of each free block.
     """
@@ -106,7 +106,7 @@ def with_hits(view, table, hit_table, hit_coords, n_hits, free, n_free, mixed, n
         if find(hit_table, hit_coords, x, y, z) < 0:
             free[kept, 0], free[kept, 1], free[kept, 2] = x, y, z
             kept += 1
-    for h in range(n_hits):  # in blocks called free, and in those on the very border of the view
+    for h in range(n_hits):  # in blocks that were free, and in blocks on the very border of the view
         if not listed[h]:
             for axis in range(3):
                 mixed[n_mixed, axis] = hit_coords[h, axis]
@@ -120,7 +120,7 @@ def with_hits(view, table, hit_table, hit_coords, n_hits, free, n_free, mixed, n
 def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, scratch):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
-    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
+    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) index of each block among the hits,
     -1 for none. scratch: a `LayerScratch`.
     """
     for i in range(blocks.shape[0]):
@@ -147,7 +147,7 @@ def _pass(view, table, blocks, out):
 
 @cell
 def corner(view, bx, by, bz):
-    """Return where the corner of block (bx, by, bz) stands, camera axes, x and y times the focal length."""
+    """Return the corner of block (bx, by, bz) in camera axes, x and y times the focal length."""
     side = np.float32(8) * view.voxel_size
     R = view.rotation
     px = np.float32(bx) * side - view.position[0]
@@ -173,7 +173,7 @@ def _push(stack, waiting, x, y, z, size):
 
 @cell
 def _enter(blocks, n, x, y, z, size):
-    """List all blocks of a box `size` blocks wide; return how many are listed now."""
+    """List all blocks of a box `size` blocks wide; return the new length of the list."""
     for i in range(size):
         for j in range(size):
             for k in range(size):
@@ -184,7 +184,7 @@ def _enter(blocks, n, x, y, z, size):
 
 @cell
 def _touched(view, end, axis):
-    """Return the first blocks of the first and the last coarse box along an axis that the view up to `end` touches."""
+    """Return the first blocks of the first and the last coarse box that the view up to `end` touches along an axis."""
     last_u, last_v = view.columns.size - 1, view.rows.shape[0] - 1
     rim_x = (view.rim[0] / end + ONE) / view.intrinsics[0]
     rim_y = (view.rim[1] / end + ONE) / view.intrinsics[1]
@@ -217,7 +217,7 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
     ez = half * _extent(R, 2)
     z_low, z_high = z - ez, z + ez
-    blind = NEAR_PLANE if table.marks else max(NEAR_PLANE, table.blind)  # marks may stand nearer
+    blind = NEAR_PLANE if table.marks else max(NEAR_PLANE, table.blind)  # marks may be nearer
     if z_high <= blind or z_low > view.max_range or _outside(view, half, px, py, pz):
         return SKIP
     if z_low <= max(NEAR_PLANE, table.blind):
@@ -253,13 +253,13 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
 
 @cell
 def _extent(rotation, axis):
-    """Return the half width along one axis of the camera of a box of half width 1."""
+    """Return the half width of a box of half width 1 along one axis of the camera."""
     return abs(rotation[axis, 0]) + abs(rotation[axis, 1]) + abs(rotation[axis, 2])
 
 
 @cell
 def _outside(view, half, px, py, pz):
-    """Return whether a box of half width `half` about (px, py, pz) lies wholly beyond one side of the image."""
+    """Return whether a box of half width `half` about (px, py, pz) is wholly beyond one side of the image."""
     for side in range(4):
         plane = view.sides[side]
         height = plane[0] * px + plane[1] * py + plane[2] * pz + half * plane[3] + plane[4]
@@ -319,7 +319,7 @@ def _nearest(nearest, tile, u0, u1, v0, v1):
 
 @cell
 def _passed(view, table, cz):
-    """Return the largest loss of the cells of a block that are looked through, by the depth of its centre.
+    """Return the largest loss of the cells of a block that are seen through, by the depth of its centre.
 
     cz: depth of the block's corner.
     """
@@ -348,14 +348,13 @@ def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
             _look_up(view, table, scratch, lowest, out[cells])
 
 
-# Finding the places, loading from them and computing with what was loaded are loops of their own, here and below: most
-# processors have no fast instruction that loads from many places, and for them the compiler then takes a whole loop one
-# cell at a time.
+# Computing indices, loading from them and computing with the loaded values are separate loops, here and below: most
+# processors have no fast gather instruction, and for them the compiler would not vectorise a loop that contains one.
 
 
 @cell
 def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
-    """Fill `depths` with the depth of each cell's centre and `at` with where its window value stands.
+    """Fill `depths` with the depth of each cell's centre and `at` with the index of its window value.
 
     nearest: depth up to which cells are skipped.
     """
@@ -368,7 +367,7 @@ def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
 
 @cell
 def window_place(view, windows, nearest, x, y, z):
-    """Return where the window value of a cell stands; that of one that is not looked at is UNSEEN.
+    """Return the index of a cell's window value; for a cell that is skipped or not seen, of UNSEEN.
 
     x, y, z: its centre in camera axes, x and y times the focal length. nearest: depth up to which cells are skipped.
     """
@@ -395,7 +394,7 @@ def _load(values, at, out):
 
 @cell
 def _write_free_layer(depths, measured, before, behind, lowest, out):
-    """Write `lowest` for cells wholly before their measurement, else 0; return whether any lies near it."""
+    """Write `lowest` for cells wholly before their measurement, else 0; return whether any is near it."""
     near = np.int32(0)
     for c in range(LAYER):
         ahead = measured[c] - depths[c]
@@ -427,9 +426,9 @@ def measured_row(view, table, measured):
 
 @cell
 def table_place(table, row, behind, scale):
-    """Return where the table, as a flat array, says what a cell gets so far `behind` a measurement in metres.
+    """Return the index, in the flat table, of the evidence on a cell `behind` metres behind a measurement.
 
-    scale: table columns a metre in this row.
+    scale: table columns per metre in this row.
     """
     columns = np.int32(table.clear.shape[1])
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
@@ -439,13 +438,13 @@ def table_place(table, row, behind, scale):
 
 @cell
 def cleared(said, lowest, measured):
-    """Return what a cell gets of which the table says so, never below `lowest`: nothing if nothing was measured."""
+    """Return the evidence on a cell by its table entry `said`, never below `lowest`; 0 without a measurement."""
     return np.int16(max(said, lowest) if measured > ZERO else np.int32(0))
 
 
 @cell
 def marked(depth_m, view, table, cx, cy, cz, c):
-    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 if there is none."""
+    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 for none."""
     rows = table.hit.size
     last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
     z = cz + view.steps[2, c]

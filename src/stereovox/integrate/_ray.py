@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of ray casting (`cast`, Amanatides and Woo 1987) and of line drawing (`draw`, Chien 2020, 3.4).
 
-Line drawing takes one sample in each layer of cells along the ray's longest axis (Chien 2020, Alg 1); it skips the
-cells that a ray only grazes.
+Line drawing takes one sample in each layer of cells along the ray's longest axis (Chien 2020, Alg 1); it skips cells
+that a ray only grazes.
 """
 
 import numpy as np
@@ -24,20 +24,20 @@ from stereovox.integrate._lanes import (
 from stereovox.kernels._jit import cell, kernel
 
 OFF_FACE = np.float32(1e-3)
-"""Distance in cells that samples keep from the faces of cells, where rounding would choose the cell."""
+"""Distance in cells that samples keep from the faces of cells, at which rounding would choose the cell."""
 BEYOND = np.float32(1e30)
-"""Stands for infinity: depth of the next face along an axis that a ray does not advance on."""
+"""Stands for infinity: depth of the next face along an axis on which a ray does not advance."""
 TINY = np.float32(1e-30)
 
 
 @kernel
 def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first, stop, step):
-    """Add the evidence of all rays of some rows to an empty pool; return False when it is too small.
+    """Add the evidence of all rays of some rows to an empty pool; return False if it is too small.
 
     depth_m: (h, w) REP 117 depth image. look_up: the sensor table (rows * columns,), both signs together.
     weight: every ray adds its evidence to every cell it crosses, times min(1, weight * depth^2) (Chien 2020, Eq 3.21),
-    in units of 1/1024 thousandths; None: a cell keeps the strongest. Blocks count from the camera's own.
-    first, stop, step: every `step`-th row from `first` on, up to `stop`.
+    in units of 1/1024 thousandths; None: a cell keeps the strongest. Block coordinates count from the camera's block.
+    first, stop, step: every `step`-th row from `first` to before `stop`.
     """
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
@@ -64,9 +64,9 @@ def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
 def walk(
     lanes, position, signs, tableless_to, table, look_up, weight, memory, pool_table, coords, count, values
 ):  # fmt: skip
-    """Follow all rays from their first cells to their ends, then give their hits; return False when the pool is full.
+    """Follow all rays from their first cells to their ends, then give their hits; return False if the pool is full.
 
-    tableless_to: depth up to which cells may begin that need no look at the sensor table.
+    tableless_to: depth up to which cells may begin that do not need the sensor table.
     """
     reached, going = ZERO, True
     while going:
@@ -84,7 +84,7 @@ def walk(
 
 @cell
 def first_cell(position, signs, keys):
-    """Return the key of the first cell that rays with these signs cross, and the faces at which they leave it."""
+    """Return the key of the first cell that rays with these signs cross, and the faces through which they leave it."""
     x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
     key = pack(np.int32(x), np.int32(y), np.int32(z), keys)
     return key, x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
@@ -105,15 +105,15 @@ def _start(ray, position, signs, lanes):
 
 @cell
 def _step(lanes, position, signs):
-    """Fill key and middle of the lanes for the cells they are in and move to the next ones.
+    """Fill key and middle of the lanes for their present cells, and move to the next ones.
 
-    Return the depth that the farthest ray has reached, whether any goes on, and the starts for `give`.
+    Return the depth that the farthest ray has reached, whether any ray continues, and the starts for `give`.
     """
     px, py, pz = position
     sx, sy, sz = signs
     by_x, by_y, by_z = strides(signs, lanes.cell)
     starts, before = np.int32(0), lanes.cell[0]
-    reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
+    reached = np.int32(0)  # the bits of a non-negative float: integer comparisons vectorise
     for i in range(LANES):
         x, y, z = lanes.x[i], lanes.y[i], lanes.z[i]
         tx = (x - px) * lanes.per_x[i]  # depth at which the ray leaves its cell along this axis
@@ -140,7 +140,7 @@ def _step(lanes, position, signs):
 
 @cell
 def _first(start, sign):
-    """Return the first cell along one axis: from a face on, a ray goes back into the cell before it."""
+    """Return the first cell along one axis: from a face, a backward ray enters the cell before it."""
     return np.ceil(start) - ONE if sign < ZERO else np.floor(start)
 
 
@@ -184,7 +184,7 @@ def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
 
 @cell
 def _off_faces(place):
-    """Return a camera's coordinate on one axis, in cells, moved a little off the faces; its samples follow."""
+    """Return a camera's coordinate on one axis, in cells, moved a little off the faces, and so its samples."""
     cell_number = np.floor(place)
     return cell_number + min(max(place - cell_number, OFF_FACE), ONE - OFF_FACE)
 
@@ -203,11 +203,11 @@ def _line_start(ray, lanes):
 def _line_step(lanes, number, start):
     """Fill key and middle of the lanes at sample `number`.
 
-    Return the depth of the farthest ray's next sample, whether there is any, and the starts for `give`.
+    Return the depth of the farthest ray's next sample, whether there is one, and the starts for `give`.
     """
     px, py, pz = start
     starts, before = np.int32(0), lanes.key.dtype.type(-1)
-    reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
+    reached = np.int32(0)  # the bits of a non-negative float: integer comparisons vectorise
     for i in range(LANES):
         depth, end = number * lanes.entered[i], lanes.end[i]
         x = np.int32(np.floor(depth * lanes.per_x[i] + px))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that build window images: how far one sees through the pixels about a place, for windows of all sizes.
+"""Kernels that build window images: how far one sees through the pixels around a point, for windows of all sizes.
 
-Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
-around it. A tile is seen through as far as its nearest pixel (`_shrink`): next to an edge or a hole, where depths are
-often wrong and thin things are missed, cells from some four pixels on are cleared only by patches that see through as a
-whole, smaller ones by single pixels. For fast culling each level also has the nearest and farthest value of tiles of 16
-and 64 of its own pixels. No value is 0, so it is the nearest of all and never clears anything.
+Level 0 is the depth image itself; level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
+around it. One sees through a tile as far as its nearest pixel (`_shrink`). Next to an edge or a hole depths are often
+wrong and thin things are missed, so cells larger than about four pixels are cleared only by patches that see through as
+a whole, smaller ones by single pixels. For fast culling each level also has the nearest and farthest value of tiles of
+16 and 64 of its own pixels. A missing value is 0: the nearest of all, which never clears anything.
 
-All levels stand in one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side
-below that; so the place of a pixel takes a few sums and no table look-up (`place`).
+All levels share one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side below
+that; so the index of a pixel takes a few sums and no table look-up (`place`).
 """
 
 import numpy as np
@@ -23,14 +23,14 @@ TWO = np.float32(2)
 
 @cell
 def place(level, v, u, pitch, height):
-    """Return where the window value at row v, column u of the depth image stands, for a level from 0 to COARSEST.
+    """Return the index of the window value at row v, column u of the depth image, for a level from 0 to COARSEST.
 
-    v, u: float32, rounded down. All else, and what is returned, is int32: shifts by a variable would take 64 bits.
+    v, u: float32, rounded down. All else, and the result, is int32: shifts by a variable would take 64 bits.
     """
     halvings = max(np.int32(level - np.int32(1)), np.int32(0))
     scale = float_of(np.int32(np.int32(np.int32(127) - halvings) * np.int32(1 << 23)))  # 2^-halvings
     wide, below = np.float32(np.int32(pitch + pitch)), np.int32(height * pitch)
-    beside = np.int32(pitch - np.int32(wide * scale))  # where the levels from 2 on start in their rows
+    beside = np.int32(pitch - np.int32(wide * scale))  # start of the levels from 2 on in their rows
     level_0_or_1 = below if level == 0 else np.int32(0)
     start = np.int32(np.int32(below + below) + beside) if halvings > 0 else level_0_or_1
     return np.int32(start + np.int32(np.int32(np.int32(v * scale) * pitch) + np.int32(u * scale)))
@@ -78,7 +78,7 @@ def build(depth_m, windows, scratch):
 
 @cell
 def farthest_of(windows):
-    """Return the farthest value of all window images, which the finest one has."""
+    """Return the farthest value of all window images, which is in the finest one."""
     first, farthest = windows.first, ZERO
     start = windows.tile_offset[first, 1]
     for i in range(start, start + windows.tile_width[first, 1] * ((windows.shape[first, 0] + 63) >> 6)):
@@ -90,9 +90,9 @@ def farthest_of(windows):
 def _shrink(depth_m, shape, base, pitch, near, known):
     """Write how far one sees through each tile of the levels from 2 on to `base`, laid out like the window images.
 
-    A tile has four parts, of the level before: one sees through it as far as through the nearest of those that have a
-    value, and nowhere where most have none. At the border tiles end with the image: its last row and column count
-    twice. near, known: (pitch,) scratch.
+    A tile has four parts, of the previous level: one sees through it as far as through the nearest part with a value,
+    and not at all if most parts have none. At the border tiles end with the image: its last row and column count twice.
+    near, known: (pitch,) scratch.
     """
     height = shape[0, 0]
     for level in range(2, COARSEST + 1):
@@ -117,13 +117,13 @@ def _shrink(depth_m, shape, base, pitch, near, known):
 
 @cell
 def nearness(depth):
-    """Return a depth as a number to take the nearest of; no value is NO_RETURN."""
+    """Return a depth for taking minima; a missing value is NO_RETURN."""
     return min(depth, NO_RETURN) if depth > ZERO else NO_RETURN
 
 
 @cell
 def seen_through(nearest, known):
-    """Return how far one sees through a tile of which so many parts of four have a value."""
+    """Return how far one sees through a tile with `known` parts of four that have a value."""
     return nearest if known >= TWO else ZERO
 
 
@@ -135,7 +135,7 @@ def _copy_usable(source, width, out):
 
 @cell
 def _three_rows(depth_m, v, rows, columns, ring):
-    """Have rows v - 1 to v + 1 of the depth image in `ring` (4, pitch), where those before v + 1 already are."""
+    """Bring rows v - 1 to v + 1 of the depth image into `ring` (4, pitch), which already holds those before v + 1."""
     for line in range(v if v == 0 else v + 1, min(v + 2, rows)):
         _copy_usable(depth_m[line * columns :], columns, ring[line & 3])
 
@@ -160,7 +160,7 @@ def _window_row(above, here, below, width, row, out):
 
 @cell
 def _take_in(line, width, v, high_row, low_row):
-    """Take row v of window values into the highest, and the highest of their opposites, of up to 16 rows."""
+    """Merge row v of window values into the maxima of up to 16 rows, of the values and of their negatives."""
     if v % 16 == 0:
         for u in range(width):
             high_row[u] = line[u]
@@ -173,7 +173,7 @@ def _take_in(line, width, v, high_row, low_row):
 
 @cell
 def _most_of_16(row, width, other):
-    """Put the highest value of each 16 columns into the first ones of `row`."""
+    """Write the highest value of each 16 columns to the start of `row`."""
     for _ in range(2):
         _halved_row(row, width, other)
         _halved_row(other, (width + 1) >> 1, row)
@@ -182,7 +182,7 @@ def _most_of_16(row, width, other):
 
 @cell
 def _put(row, number, tiles, start, big, highest):
-    """Enter a row of tiles of 16, and take it into that of tiles of 64; where not `highest`, `row` holds opposites."""
+    """Write a row of tiles of 16, and merge it into the tiles of 64; unless `highest`, `row` holds negatives."""
     for tu in range(number):
         k = big + (tu >> 2)
         value = row[tu] if highest else -row[tu]
@@ -199,7 +199,7 @@ def _fill_big(lows, highs, start, number):
 
 @cell
 def nearest_tiles(depth_m, lows16, lows64):
-    """Fill tiles (rows, columns) of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
+    """Fill tiles (rows, columns) of 16 and 64 pixels with their nearest depth, ignoring pixels without value."""
     height, width = depth_m.shape
     lows64[:, :] = NO_RETURN
     for tv in range((height + 15) // 16):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a scan to evidence on the cells of a grid: beams clear what they pass and mark where they end.
+"""From a scan to evidence on the cells of a grid: beams clear the cells they pass and mark the cells they hit.
 
 IST 2019, section II; the map adds the evidence by its Eq 5.
 """
@@ -26,17 +26,17 @@ TRAVERSALS = {
     "bresenham": "stereovox.integrate._beams:bresenham",
     "exact": "stereovox.integrate._beams:exact",
 }
-"""Name -> kernel `(lines, first, columns, rows, gain, adding, values)`, see `_beams.exact`; others as entry points."""
+"""Name -> kernel `(lines, first, columns, rows, gain, adding, values)`, see `_beams.exact`; more by entry points."""
 MAX_CELLS = 4096
-"""Cells a beam may be long: a scan's patch is at most four times the square of it."""
+"""Most cells of a beam: a scan's patch is at most four times the square of it."""
 MAX_BEAMS = 65536
 """Most beams of a scan: the sum of their largest evidence fits into 32 bits."""
 UPDATES = {"once": (None, np.int16), "every": (1, np.int32)}
-"""Whether the evidence of beams on a cell is summed (None: the last one counts), and the dtype of the sum."""
+"""Whether the evidence of beams on a cell is summed (None: the last counts), and the dtype of the sum."""
 
 
 def make_beams(config: Config) -> Beams:
-    """Return the configured `Beams`. Raises ConfigError for settings that cannot be met."""
+    """Return the configured `Beams`. Raises ConfigError for settings that do not fit together."""
     return Beams(config)
 
 
@@ -64,10 +64,9 @@ class Beams:
         """Return the evidence of a validated scan on the cells of a grid with this `origin` (3,): x, y, yaw.
 
         A range from `range_min` to min(`range_max`, `config.max_range`) is a hit: its beam is free up to it, and
-        occupied from it to `grid.thickness` behind. +inf, and a hit beyond `config.max_range`, is free up to that
-        minimum. Other ranges give no evidence. If the scan has `clear`, that is how far its beams are free,
-        and `clear_from` from where. A beam never clears the cell it hits. If the sensor leans, lengths are as seen
-        from above.
+        occupied from there to `grid.thickness` behind it. +inf, or a hit beyond `config.max_range`, is free up to that
+        minimum. Other ranges give no evidence. If the scan has `clear`, its beams are free up to there, and from
+        `clear_from` on. A beam never clears the cell it hits. If the sensor leans, lengths are projected to the floor.
         The memory of the evidence is reused by the next call.
         Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
         """
@@ -90,14 +89,14 @@ class Beams:
     def _aim(
         self, scan: Scan, origin: NDArray[np.float64]
     ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], NDArray[np.int64]]:
-        """Return the lines to clear, to occupy, those whose clearing a hit cancels, each beam's ends, and their box."""
+        """Return the lines to clear, to occupy, and to un-clear at hits; each beam's ends; and the box of all."""
         size, config = self._config.voxel_size, self._config
         ranges, clear, clear_from = _beams_of(scan)
         T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
         if not ((np.abs(position) < INDEX_LIMIT - 2 * MAX_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
             raise FrameRefused(
-                "pose_too_far", f"{name_of(scan)}: is more than {INDEX_LIMIT} cells from the map's origin"
+                "pose_too_far", f"{name_of(scan)}: it is more than {INDEX_LIMIT} cells from the map's origin"
             )
         reach = np.fmin(scan.range_max, config.max_range)
         with np.errstate(over="ignore"):
@@ -113,7 +112,7 @@ class Beams:
         return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], ends, box
 
     def _directions_of(self, scan: Scan) -> NDArray[np.float64]:
-        """Return cosine and sine (N, 2) of each beam; those of the scan before, if it had the same angles."""
+        """Return cosine and sine (N, 2) of each beam; reused from the previous scan if it had the same angles."""
         seen = float(scan.angle_min), float(scan.angle_step), len(scan.ranges)
         if seen != self._seen:
             if not np.isfinite(seen[0] + seen[1] * seen[2]):
@@ -122,7 +121,7 @@ class Beams:
         return self._directions
 
     def _patch(self, low: NDArray[np.int64], across: int, tiles: int) -> tuple[Any, Any]:
-        """Return coordinates and empty values of the tiles of a patch."""
+        """Return coordinates and zeroed values of the tiles of a patch."""
         if len(self._values) < tiles:
             self._values = np.empty((tiles, CELLS), self._values.dtype)
             self._coords = np.empty((tiles, 3), np.int32)
@@ -132,10 +131,10 @@ class Beams:
 
 
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
-    """Return ranges, how far beams are known to be free (empty: as by ranges), and from where on (empty: 0)."""
+    """Return ranges, how far beams are known to be free (empty: by ranges), and from where (empty: 0)."""
     shape = np.shape(scan.ranges)
     if shape[0] > MAX_BEAMS:
-        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MAX_BEAMS} are taken")
+        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MAX_BEAMS} are accepted")
     for what in ("clear", "clear_from"):
         given = getattr(scan, what)
         if given is not None and (given.shape != shape or given.dtype.kind not in "fiu"):

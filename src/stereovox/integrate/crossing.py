@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells that the rays of a lidar scan cross, and the evidence of a scan on them: for points that are no image."""
+"""The cells that the rays of a lidar scan cross, and the evidence of a scan on them: for points that form no image."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, SIDE, blocks_of_cells
 
 AT_ONCE = 1 << 22
-"""Cells walked before those found twice are dropped."""
+"""Cells walked before duplicates are dropped."""
 MAX_LENGTH = 1 << 20
-"""Cells along each axis from the sensor to the end of a ray."""
+"""Most cells along each axis from the sensor to the end of a ray."""
 
 
 def crossed_cells(origin: NDArray[np.float64], ends: NDArray[np.float64], voxel_size: float) -> NDArray[np.int64]:
-    """Return the cells (M, 3) that the rays from `origin` (3,) to `ends` (N, 3) cross, each once, ascending.
+    """Return the cells (M, 3) that the rays from `origin` (3,) to `ends` (N, 3) cross, each once, in ascending order.
 
-    All in metres. The cells of the ends are included.
+    Origin and ends are in metres. The cells of the ends are included.
     Raises StereovoxError for a ray of more than `MAX_LENGTH` cells.
     """
     start, stop = np.asarray(origin, np.float64) / voxel_size, np.asarray(ends, np.float64).reshape(-1, 3) / voxel_size
@@ -45,13 +45,14 @@ def scan_evidence(
 ) -> Evidence:
     """Return the evidence of one scan: `hit` for each cell that holds an end, `miss` for the others that rays cross.
 
-    origin: (3,) and ends: (N, 3) in metres, world frame. One ray is walked to each cell with ends: fewer cells are
-    crossed than by all, none more. hit, miss: log-odds in thousandths. Raises StereovoxError as `crossed_cells`.
+    origin: (3,) and ends: (N, 3) in metres, world frame. Only one ray is walked to each cell with ends, so some cells
+    that other rays cross are missed, but none is added. hit, miss: log-odds in thousandths. Raises StereovoxError as
+    `crossed_cells`.
     """
     cells = np.floor(ends / voxel_size).astype(np.int64)
     hits, chosen = np.unique(cells, axis=0, return_index=True)
     crossed = crossed_cells(origin, ends[chosen], voxel_size)
-    together = np.concatenate([crossed, hits])  # where a cell is both, the later one counts
+    together = np.concatenate([crossed, hits])  # if a cell is in both, the later one counts
     gains = np.repeat(np.array([miss, hit], np.int16), [len(crossed), len(hits)])
     blocks, of_cell = blocks_of_cells(together)
     x, y, z = (together & (SIDE - 1)).T
@@ -68,7 +69,7 @@ def _pieces(steps: NDArray[np.int64]) -> list[slice]:
 
 
 def _packed(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return one number (N,) for each cell (N, 3) within `MAX_LENGTH` of 0; they ascend as the cells do."""
+    """Return one number (N,) for each cell (N, 3) within `MAX_LENGTH` of 0, in the same order as the cells."""
     x, y, z = (cells + MAX_LENGTH).T
     return (x << 42) | (y << 21) | z
 

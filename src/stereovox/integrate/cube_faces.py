@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cut wide depth images into pinhole images: the faces of a cube round the eye, as far as the camera sees them."""
+"""Cut wide depth images into pinhole images: the faces of a cube around the eye, as far as the camera sees them."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 """Directions of the six faces in the optical frame of the wide camera."""
 MIN_PIXELS, MAX_SHARE = 1 << 18, 16
-"""Pixels that all faces may have for any image, and more for each of its pixels. A sphere needs less than two."""
+"""Most pixels of all faces: a base for any image, and more per pixel of the image; a sphere needs less than two."""
 Window = tuple[float, float, float, float]
-"""Slopes of a face between which it sees something: left, top, right, bottom."""
+"""Slopes that bound the visible part of a face: left, top, right, bottom."""
 
 
 class Face(NamedTuple):
     """The part of one side of the cube that the wide camera sees.
 
     T_wide_face: (4, 4) maps its optical frame into the wide camera's. pixel: (height, width) index of the wide image's
-    pixel, -1 if it sees none. scale: (height, width) depth along the face's axis over depth of the wide camera.
+    pixel, -1 for none. scale: (height, width) depth along the face's axis over depth of the wide camera.
     """
 
     camera: PinholeCamera
@@ -43,7 +43,7 @@ class FaceImage(NamedTuple):
     """The view of one face.
 
     image: a pinhole's depth image. ends: (height, width) float32, the same, but for pixels that see nothing up to the
-    maximum range: the depth along the face's axis up to which that is so.
+    maximum range, the depth along the face's axis up to which they see nothing.
     """
 
     image: DepthImage
@@ -51,10 +51,10 @@ class FaceImage(NamedTuple):
 
 
 def faces_of(camera: WideCamera, config: Config) -> list[Face]:
-    """Return the faces that a wide camera sees. They do not overlap, and miss no row or column, except
-    rows that crowd near the x axis.
+    """Return the faces that a wide camera sees. They do not overlap, and miss no row or column, except for rows that
+    crowd near the x axis.
 
-    Raises FrameRefused `bad_camera` if the view or the faces were out of proportion to the image.
+    Raises FrameRefused `bad_camera` if the view or the faces are out of proportion to the image.
     """
     check_view(camera, config)
     try:
@@ -70,7 +70,7 @@ def faces_of(camera: WideCamera, config: Config) -> list[Face]:
 
 
 def cut(image: DepthImage, face: Face, max_range: float) -> FaceImage:
-    """Return what a face sees of a wide camera's depth image; each of its pixels takes the nearest of the image's.
+    """Return the part of a wide camera's depth image on a face; each pixel takes the nearest pixel of the image.
 
     max_range: metres, a depth of the wide camera.
     """
@@ -83,7 +83,7 @@ def cut(image: DepthImage, face: Face, max_range: float) -> FaceImage:
 
 
 def _pinhole(camera: WideCamera, forward: tuple[int, int, int]) -> PinholeCamera | None:
-    """Return the pinhole camera of a face: pixels as fine as the wide camera's, as far as that sees; None: it does not.
+    """Return the pinhole camera of a face, with pixels as fine as the wide camera's, cut to its view; None if unseen.
 
     A whole face spans slopes from -1 to 1 in whole pixels, so that neighbours meet at their borders.
     """
@@ -103,9 +103,9 @@ def _pinhole(camera: WideCamera, forward: tuple[int, int, int]) -> PinholeCamera
 
 
 def _around(camera: WideCamera, middle: float) -> Window | None:
-    """Return where a face that looks in the direction of rows, `middle` radians down from the z axis, sees the image.
+    """Return the window of a face that looks in the direction of rows, `middle` radians down from the z axis.
 
-    A ray `a` next to the y-z plane has the slopes x = tan(a) |1, y| and y.
+    A ray at angle `a` from the y-z plane has the slopes x = tan(a) |1, y| and y.
     """
     left, right, top, bottom = camera.borders
     first = middle + 2 * pi * floor((top - middle) / (2 * pi))
@@ -121,9 +121,9 @@ def _around(camera: WideCamera, middle: float) -> Window | None:
 
 
 def _beside(camera: WideCamera, side: int) -> Window | None:
-    """Return where the face that looks along the x axis (side 1) or back along it (-1) sees the image.
+    """Return the window of the face that looks along the x axis (side 1) or back along it (-1).
 
-    A ray `a` next to the y-z plane stands 1 / tan(a) from its middle, in the direction of its row.
+    A ray at angle `a` from the y-z plane is 1 / tan(a) from the face's middle, in the direction of its row.
     """
     left, right, top, bottom = camera.borders
     near, far = (left, right) if side > 0 else (-right, -left)
@@ -152,13 +152,13 @@ def _face(camera: WideCamera, pinhole: PinholeCamera, forward: NDArray[np.float6
 
 
 def _rotation(forward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a rotation whose z axis is `forward`, and whose x axis is the wide camera's if it can be."""
+    """Return a rotation whose z axis is `forward`, and whose x axis is the wide camera's if possible."""
     right = np.array([0.0, 0, -1]) * forward[0] if forward[0] else np.array([1.0, 0, 0])
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
 def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return the index of the pixel that looks in each direction (..., 3), -1 if none does."""
+    """Return the index of the pixel that looks in each direction (..., 3), -1 for none."""
     if isinstance(camera, SphericalCamera):
         u = np.arctan2(directions[..., 0], across) / camera.step_u + camera.cu
     else:
@@ -166,7 +166,7 @@ def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray
             u = directions[..., 0] / across * camera.fx + camera.cx
     turn = 2 * np.pi / camera.step_v
     v = np.arctan2(directions[..., 1], directions[..., 2]) / camera.step_v + camera.cv
-    v = v - turn * np.floor((v + 0.5) / turn)  # rows that look back are counted on from the first
+    v = v - turn * np.floor((v + 0.5) / turn)  # rows that look back continue the count from the first
     inside = (u >= -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
     column, row = (np.where(inside, np.floor(x + 0.5), 0).astype(np.int64) for x in (u, v))
     return np.where(inside, row * camera.width + column, -1).astype(np.int32)

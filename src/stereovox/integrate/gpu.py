@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The projective integrator on a graphics card: evidence is made and stays there, cell for cell that of `projective`.
+"""The projective integrator on a graphics card: evidence is made and stays there, identical to that of `projective`.
 
-Pinhole cameras only. Per frame the depth image and the view go to the card, and some numbers of blocks come back.
+Pinhole cameras only. Per frame the depth image and the view go to the card, and a few block counts come back.
 Imported only if `device = "cuda"`.
 """
 
@@ -28,11 +28,11 @@ from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 
 HIT_ROOM = 1024
-"""Blocks with hits for which there is room at first."""
+"""Initial room for blocks with hits."""
 
 
 class GpuProjective:
-    """Evidence by projection on a graphics card. Raises ConfigError for a bad sensor model, and without a card."""
+    """Evidence by projection on a graphics card. Raises ConfigError for a bad sensor model, or without a card."""
 
     def __init__(self, config: Config):
         check_device()
@@ -44,7 +44,7 @@ class GpuProjective:
         Raises ConfigError for a wide camera, FrameRefused `memory_full` if the card has no room for it.
         """
         if not isinstance(image.camera, PinholeCamera):
-            raise ConfigError('device "cuda" maps pinhole cameras only, and this one is wider; use device "cpu"')
+            raise ConfigError('device "cuda" maps pinhole cameras only, but this one is wider; use device "cpu"')
         try:
             return self._eyes[image.camera].evidence(image)
         except MemoryError as error:
@@ -107,7 +107,7 @@ class GpuEye:
         launch(_gpu.passed, view, self._table, origin, hits.table, hits.coords, *free)
 
     def _has_room(self, counts: NDArray[np.int32]) -> bool:
-        """Return whether all lists were long enough; if not, make them longer, for another try."""
+        """Return whether all lists were long enough; if not, make them longer for another try."""
         most = int(counts[[_gpu.LARGE, _gpu.MIDDLE, _gpu.SEEN_FREE, _gpu.SEEN_MIXED]].max())
         hit_blocks, room, hit_room = int(counts[_gpu.HIT_BLOCKS]), len(self._free), len(self._hits.coords)
         if most > room:
@@ -119,7 +119,7 @@ class GpuEye:
         return most <= room and hit_blocks <= hit_room
 
     def _make_room(self, blocks: int) -> None:
-        """Make lists for so many blocks of each kind: all of them, or none if there is no room."""
+        """Make lists for this many blocks of each kind: all of them, or none if memory is short."""
         lists = [gpu_array((blocks, 3), np.int32) for _ in range(4)]
         hit_of = gpu_array(blocks, np.int32)
         made = GpuArrays(
@@ -133,7 +133,7 @@ class GpuEye:
 
 
 class GpuView:
-    """The views of one camera on the card; what changes from frame to frame goes there in one piece."""
+    """The views of one camera on the card; the parts that change per frame are copied in one piece."""
 
     def __init__(self, view: View):
         names = [name for name, part in zip(view._fields, view, strict=True) if isinstance(part, np.ndarray)]
@@ -150,7 +150,7 @@ class GpuView:
         self._view = view._replace(**parts, **fixed)
 
     def at(self, view: View) -> View:
-        """Return `view` on the card; it holds until the next call."""
+        """Return `view` on the card; it is valid until the next call."""
         self._buffer.copy_to_device(np.concatenate([getattr(view, name).ravel() for name in self._names]))
         return self._view
 
@@ -179,9 +179,9 @@ class GpuWindows:
 class GpuHits:
     """Finds the hits of one camera on the card, and keeps the memory for them; see `HitFinder`.
 
-    coords, values: (room, 3) and (room, 512) of the blocks with hits, which count from the camera's. table: their hash.
-    taken: (room,) uint8, whether a block is among the mixed ones. claims, block_claims: hashes of the keys of cells and
-    blocks with hits.
+    coords, values: (room, 3) and (room, 512) of the blocks with hits, counted from the camera's block. table: their
+    hash. taken: (room,) uint8, whether a block is among the mixed ones. claims, block_claims: hashes of the keys of
+    cells and blocks with hits.
     """
 
     def __init__(self, camera: PinholeCamera, config: Config):
@@ -194,7 +194,7 @@ class GpuHits:
         self.make_room(HIT_ROOM)
 
     def make_room(self, blocks: int) -> None:
-        """Make room for so many blocks with hits: in all arrays, or in none if there is no room."""
+        """Make room for this many blocks with hits: in all arrays, or in none if memory is short."""
         self.coords, self.values, self.table, self.taken = (
             gpu_array((blocks, 3), np.int32),
             gpu_array((blocks, CELLS), np.int16),
@@ -203,7 +203,7 @@ class GpuHits:
         )
 
     def find(self, depth_m: Any, view: View, table: Any, counts: Any) -> None:
-        """List the blocks with hits of a flat REP 117 depth image on the card; all tables are empty."""
+        """List the blocks with hits of a flat REP 117 depth image on the card; all tables must be empty."""
         launch(_gpu.list_cells, depth_m, view, self._wide, self.claims, self._listed, counts)
         launch(_gpu.list_blocks, self._listed, self._wide, self.block_claims, self.coords, counts)
         launch(_gpu.enter_blocks, self.table, self.coords, self.values, self.taken, counts)

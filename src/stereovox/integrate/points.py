@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence of clouds: every ray is followed by itself, from where the sensor was to its point."""
+"""Evidence of clouds: each ray is followed from the sensor's position at that time to its point."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 
 PLACES = 16
-"""Places along a cell's side at which rays begin: those of a moving sensor are rounded to them."""
+"""Ray origins per cell side: the origins of a moving sensor are rounded to these."""
 
 
 class _View(NamedTuple):
@@ -33,7 +33,7 @@ class _View(NamedTuple):
 
 
 class _Tools(NamedTuple):
-    """Tools of one lidar: its sensor table, and the same with both signs together."""
+    """Tools of one lidar: its sensor table, and the same table with both signs together."""
 
     table: KernelTable
     look_up: NDArray[np.int32]
@@ -42,8 +42,8 @@ class _Tools(NamedTuple):
 class Points:
     """Evidence of clouds by ray casting (Amanatides and Woo 1987), the strongest in each cell, as OctoMap does.
 
-    A cell that holds a point is a hit, whatever other rays pass it; a cell that is only passed counts once for the
-    cloud. Rays end at `max_range`; one whose point lies beyond is free as far as its noise allows.
+    A cell that holds a point is a hit, whatever other rays pass it; a cell that is only passed counts once per cloud.
+    Rays end at `max_range`; one whose point is beyond is free as far as its noise allows.
     """
 
     def __init__(self, config: Config):
@@ -56,7 +56,7 @@ class Points:
     def evidence(self, cloud: CheckedCloud) -> Evidence:
         """Return the evidence of a checked cloud; its memory is reused by the next call.
 
-        Raises FrameRefused `view_too_large` if it is on more cells than can be counted.
+        Raises FrameRefused `view_too_large` if it spans more cells than can be kept.
         """
         config, tools = self._config, self._tools[cloud.lidar]
         rays, runs, places = self._laid_out(cloud, tools.table)
@@ -91,23 +91,23 @@ class Points:
     def _laid_out(
         self, cloud: CheckedCloud, table: KernelTable
     ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
-        """Return the rays of a cloud, runs of them that go from one place the same way, and the places."""
+        """Return the rays of a cloud, runs of them with the same course (place and signs), and the places."""
         config, cell = self._config, np.array(self._config.cell)
         R, block = cloud.T_world_sensor[:3, :3], origin_block(cloud.T_world_sensor, config)
         corner = block.astype(float) * SIDE * cell
         places, of_place = self._places(cloud, R, corner, cell)
-        rays, way = np.empty((5, len(cloud.ends)), np.float32), np.empty(len(cloud.ends), np.int64)
+        rays, course = np.empty((5, len(cloud.ends)), np.float32), np.empty(len(cloud.ends), np.int64)
         used = _points.lay(
             cloud.ends, cloud.hits, of_place, places, np.ascontiguousarray(R), cloud.T_world_sensor[:3, 3] - corner,
-            cell, float(config.max_range), float(table.reach[-1]), rays, way,
+            cell, float(config.max_range), float(table.reach[-1]), rays, course,
         )  # fmt: skip
-        order = np.argsort(way[:used].astype(np.min_scalar_type(8 * len(places))), kind="stable")  # by radix
-        return np.take(rays, order, axis=1), _runs(way[order]), np.ascontiguousarray(places, np.float32)
+        order = np.argsort(course[:used].astype(np.min_scalar_type(8 * len(places))), kind="stable")  # a radix sort
+        return np.take(rays, order, axis=1), _runs(course[order]), np.ascontiguousarray(places, np.float32)
 
     def _places(
         self, cloud: CheckedCloud, R: NDArray[np.float64], corner: NDArray[np.float64], cell: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the places (P, 3) in cells where rays begin, and which of them each does (N,); (0,): there is one."""
+        """Return the places (P, 3) in cells where rays begin, and each ray's place (N,); (0,): all at the first."""
         t = cloud.T_world_sensor[:3, 3] - corner
         if cloud.origins is None:
             return t[None] / cell, np.empty(0, np.int64)
@@ -137,11 +137,11 @@ def _tools(sensor: InverseSensorModel, config: Config, lidar: Lidar) -> _Tools:
     return _Tools(table, (table.clear + table.mark).ravel())
 
 
-def _runs(way: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return runs (K, 3) of at most LANES rays with the same way, of ascending ways (N,): from, to, place."""
-    edges = np.flatnonzero(np.diff(way, prepend=-1, append=-1))
+def _runs(course: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return runs (K, 3) of at most LANES rays with the same course, of sorted courses (N,): start, end, place."""
+    edges = np.flatnonzero(np.diff(course, prepend=-1, append=-1))
     runs = [
-        np.column_stack([starts, np.minimum(starts + LANES, stop), np.full(len(starts), way[start] >> 3)])
+        np.column_stack([starts, np.minimum(starts + LANES, stop), np.full(len(starts), course[start] >> 3)])
         for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
         for starts in (np.arange(start, stop, LANES),)
     ]

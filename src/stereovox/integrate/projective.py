@@ -2,8 +2,8 @@
 """The projective integrator: cells are projected into the depth image, from coarse boxes to single cells.
 
 A frame updates each cell at most once. Cells that hold a measured point get its hit evidence, scattered from the
-pixels; every other cell gets the evidence of how far one sees through a window of about its own size (`_windows`). So
-thin near obstacles stay, small holes do not matter, and the result is near that of exact ray casting, which clears more
+pixels; every other cell gets evidence by how far one sees through a window of about its own size (`_windows`). So thin
+near obstacles stay, small holes do not matter, and the result is close to exact ray casting, which clears more
 (docs/integrators.md has figures).
 """
 
@@ -45,9 +45,9 @@ LEVELS = _windows.COARSEST + 1
 ROOM = 4096
 """Initial capacity of a camera's block lists."""
 WORTH_A_THREAD = 256
-"""Blocks whose evaluation takes longer than waking a thread."""
+"""Number of blocks whose evaluation takes longer than waking a thread."""
 WEIGHED_BY_A_THREAD = 2048
-"""Cells with hits whose weighing does."""
+"""Number of cells with hits whose weighing does."""
 
 
 class Projective:
@@ -98,8 +98,8 @@ class LayerScratch(NamedTuple):
 
     depths: NDArray[np.float32]  # of the cells' centres
     measured: NDArray[np.float32]  # window values there
-    scale: NDArray[np.float32]  # table columns a metre
-    at: NDArray[np.int32]  # places of window values, then of entries of the sensor table
+    scale: NDArray[np.float32]  # table columns per metre
+    at: NDArray[np.int32]  # indices of window values, then of entries of the sensor table
     row: NDArray[np.int32]  # rows of the sensor table, then its entries
 
 
@@ -114,7 +114,7 @@ class _Eye:
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config, rim_share: float):
         check_view(camera, config)
         self._camera, self.table = camera, table
-        self.mixed_before = 0  # blocks evaluated in the frame before: the estimate for the next
+        self.mixed_before = 0  # blocks evaluated in the last frame: the estimate for the next
         self.views = Views(camera, config, rim_share)
         self.hits = HitFinder(camera, table, config)
         self._windows = make_windows(camera, float(self.views.spread) / config.max_range)
@@ -125,9 +125,9 @@ class _Eye:
     def candidates(
         self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
     ) -> tuple[Windows, int, int]:
-        """List free and mixed blocks; return the window images, and how many there are of each.
+        """List free and mixed blocks; return the window images, and the numbers of both.
 
-        ends: `depth_m`, but for pixels that see nothing: the depth up to which that is so.
+        ends: `depth_m`, but for pixels that see nothing, the depth up to which they see nothing.
         """
         windows, scratch, nearest = self._windows
         while True:
@@ -141,8 +141,8 @@ class _Eye:
     def with_hits(
         self, view: View, n_free: int, n_mixed: int
     ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32], NDArray[np.int32]]:
-        """Return the free blocks and their evidence, the mixed ones, those with hits included, and where each of these
-        has its hits (-1: none).
+        """Return the free blocks and their evidence, the mixed ones, including those with hits, and the index of the
+        hits of each of these (-1: none).
         """
         hits = self.hits.blocks
         most = n_mixed + len(hits)
@@ -168,7 +168,7 @@ class HitFinder:
     """Finds the hits of one camera, and keeps the memory for them.
 
     blocks: the result, once `scatter` has found the cells and `weigh` has weighed them all: evidence in thousandths
-    on each cell that holds a point, 0 elsewhere; blocks count from the one the camera stands in.
+    on each cell that holds a point, 0 elsewhere; block coordinates count from the camera's block.
     """
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
@@ -185,7 +185,7 @@ class HitFinder:
         self._lanes = Scratch(_hit_lanes)
 
     def scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
-        """Find the cells that hold points of a REP 117 depth image; return how many there are."""
+        """Find the cells that hold points of a REP 117 depth image; return their number."""
         blocks = self.blocks
         blocks.clear()
         while (n := self._scatter(depth_m, view)) < 0:
@@ -210,7 +210,7 @@ class HitScratch(NamedTuple):
     """Memory of `_hits.scatter`."""
 
     keys: NDArray[np.signedinteger]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
-    news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those next to it
+    news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell differs from its neighbours'
     fresh: NDArray[np.int32]  # one longer: the pixels with such cells
     seen: NDArray[np.signedinteger]  # (SEEN,) keys of recently entered cells
 
@@ -221,14 +221,14 @@ class HitLanes(NamedTuple):
     x: NDArray[np.float32]  # the centre in camera axes, x and y times the focal length
     y: NDArray[np.float32]
     z: NDArray[np.float32]
-    share: NDArray[np.float32]  # part of the footprint that measures a depth within the cell
+    share: NDArray[np.float32]  # share of the footprint that measures a depth within the cell
     u: NDArray[np.float32]  # upper left corner of the footprint
     v: NDArray[np.float32]
     samples: NDArray[np.float32]  # along each side of it
     step: NDArray[np.float32]  # pixels between samples
     looked: NDArray[np.float32]  # samples inside the image so far
-    depth: NDArray[np.float32]  # measured at the present sample
-    counts: NDArray[np.float32]  # whether that lies inside the image, 0 or 1
+    depth: NDArray[np.float32]  # measured at the current sample
+    counts: NDArray[np.float32]  # whether that is inside the image, 0 or 1
     at: NDArray[np.int32]  # its pixel
 
 
@@ -239,13 +239,13 @@ def _hit_lanes() -> HitLanes:
 class Windows(NamedTuple):
     """All window images in one; see `_windows.py`."""
 
-    image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands; the last entry is UNSEEN
+    image: NDArray[np.float32]  # flat; `_windows.place` gives the index of a pixel; the last entry is UNSEEN
     pitch: np.int32
     height: np.int32
     shape: NDArray[np.int32]  # (levels, 2) rows and columns
     lows: NDArray[np.float32]  # nearest values of tiles
     highs: NDArray[np.float32]  # farthest
-    tile_offset: NDArray[np.int32]  # (levels, 2) where tiles of 16 and of 64 start
+    tile_offset: NDArray[np.int32]  # (levels, 2) start of tiles of 16 and of 64
     tile_width: NDArray[np.int32]  # (levels, 2) tiles in a row
     first: np.int32  # lowest level that is filled
 
@@ -255,7 +255,7 @@ class WindowScratch(NamedTuple):
 
     base: NDArray[np.float32]  # like `Windows.image`: the images before dilation
     ring: NDArray[np.float32]  # (4, pitch)
-    row: NDArray[np.float32]  # (pitch,), as the rest
+    row: NDArray[np.float32]  # (pitch,), like the rest
     other: NDArray[np.float32]
     high_row: NDArray[np.float32]
     low_row: NDArray[np.float32]
@@ -266,7 +266,7 @@ Tiles = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def make_windows(camera: PinholeCamera, smallest_tile: float) -> tuple[Windows, WindowScratch, Tiles]:
-    """Return a camera's window images, from tiles of about `smallest_tile` pixels on, and memory to build them."""
+    """Return a camera's window images, from tiles of about `smallest_tile` pixels up, and memory to build them."""
     h, w = camera.height, camera.width
     coarsest = 1 << (LEVELS - 2)
     strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
@@ -296,7 +296,7 @@ def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
 def strongest(parts: Sequence[Evidence]) -> Evidence:
     """Return one frame's evidence: a cell keeps the strongest, positive before negative, of all `parts`.
 
-    Blocks that are wholly free in one part alone stay uniform; they are expanded if another part has the block too.
+    Blocks that are wholly free stay uniform, unless another part has evidence on single cells of the block.
     """
     if len(parts) == 1:
         return parts[0]
@@ -318,8 +318,8 @@ def strongest(parts: Sequence[Evidence]) -> Evidence:
 
 
 def _alone(parts: Sequence[Evidence]) -> tuple[NDArray[np.int32], NDArray[np.int16], list[NDArray[np.bool_]]]:
-    """Return the uniform blocks that no part expands, each once with its strongest value, and for each part a mask of
-    its own uniform blocks that another part expands."""
+    """Return the uniform blocks that no part has cell by cell, each once with its strongest value, and for each part a
+    mask of its uniform blocks that another part has cell by cell."""
     spelt = np.unique(np.concatenate([part.coords for part in parts]), axis=0)
     known = {tuple(block) for block in spelt.tolist()}
     shared = [np.array([tuple(b) in known for b in part.uniform.tolist()], bool) for part in parts]

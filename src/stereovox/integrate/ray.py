@@ -43,26 +43,26 @@ Keys = NDArray[np.signedinteger]
 
 MOST_LARGER = 64
 OBLIQUE = 1.5
-"""Cells that a ray crosses for each cell's length of depth: the average over all directions."""
+"""Cells that a ray crosses per cell length of depth: the average over all directions."""
 MAX_CELL_PX = 512
-"""Most pixels along a cell at a depth of one metre; with more, `_lanes` rounds the weight of one to nothing."""
+"""Most pixels along a cell at a depth of one metre; with more, `_lanes` would round the weight of a ray to 0."""
 
 
 STEPS_PER_MS, BLOCKS_PER_MS = 200_000, 100
-"""Cells that rays cross in a millisecond at least, and blocks of cells that are new to the frame."""
+"""Least number of cells that rays cross in a millisecond, and of blocks new to the frame that are entered in one."""
 OVERRUN = 4
-"""By how many times a frame may take longer than `deadline_ms`: with more work than that its pixels are made larger.
-Below, the deadline's own levels see to it."""
+"""Estimated time of a frame, in multiples of `deadline_ms`, above which its pixels are made larger. Below that, the
+deadline's own levels suffice."""
 STEPS_AT_ONCE, SLOW_STEPS = 20_000_000, 50_000_000
-"""Cells after which Ctrl-C is heard, and from which on a frame is so slow, half a second, that the user is warned."""
+"""Cells after which Ctrl-C is checked, and cells of a frame (half a second) above which the user is warned."""
 
 
 class Ray:
     """Evidence by ray casting: every cell that a ray crosses (Chien 2020, Alg 2).
 
-    `ray.update = "every"`: each ray adds its evidence to each cell, weighted so that the rays of one cell count about
-    one (Chien 2020, Eq 3.21; the down-sampling ratio is in the focal length of the smaller image). `"once"`: a cell
-    keeps the strongest evidence of the frame, as OctoMap does.
+    `ray.update = "every"`: each ray adds its evidence to each cell, weighted so that the rays through one cell count
+    as about one (Chien 2020, Eq 3.21; the focal length of a smaller image contains the down-sampling ratio). `"once"`:
+    a cell keeps the strongest evidence of the frame, as OctoMap does.
     """
 
     _kernel: ClassVar[Callable[..., bool]] = staticmethod(_ray.cast)
@@ -72,16 +72,16 @@ class Ray:
         self._config = config
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
         self._eyes = PerCamera(partial(_eye, sensor, config))
-        self._told = False
+        self._warned = False
 
     def evidence(self, image: DepthImage) -> Evidence:
-        """Return the evidence of `image` on the cells its rays cross."""
+        """Return the evidence of `image` on the cells that its rays cross."""
         config, image = self._config, self._in_time(self._of_countable_rays(image))
         camera = image.camera
         eye, view = self._eyes[camera], rays_of(image, config)
         weight = np.float32(self._cell_px(camera) ** -2) if config.ray.update == "every" else None
         workers = len(shards(camera.height, config.threads))
-        parts = [slice(n, camera.height, workers) for n in range(workers)]  # as many long rays for each
+        parts = [slice(n, camera.height, workers) for n in range(workers)]  # equally many long rays for each
         chunks = int(self._steps(image) / workers / STEPS_AT_ONCE) + 1
         in_shards(lambda part: self._follow(image, view, weight, eye, part, chunks), parts)
         pool = merged(self._pools[:workers], weight is not None)
@@ -91,7 +91,7 @@ class Ray:
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), np.empty(0, np.int16))
 
     def _cell_px(self, camera: VirtualCamera) -> float:
-        """Return how many pixels a cell is long at a depth of one metre."""
+        """Return the side of a cell in pixels at a depth of one metre."""
         return camera.focal_px / camera.binning * self._config.voxel_size
 
     def _of_countable_rays(self, image: DepthImage) -> DepthImage:
@@ -103,12 +103,12 @@ class Ray:
             return downsample(image, ceil(cell_px / MAX_CELL_PX))
         raise FrameRefused(
             "bad_camera",
-            f"its image has {cell_px:.0f} pixels for a cell at one metre, of which ray.update every counts "
+            f"its image has {cell_px:.0f} pixels per cell at one metre, but ray.update every takes at most "
             f"{MAX_CELL_PX}; use integrator projective or ray.update once",
         )
 
     def _steps(self, image: DepthImage) -> float:
-        """Return about how many cells the rays of an image cross."""
+        """Return an estimate of the number of cells that the rays of an image cross."""
         ends = image.depth_m.clip(0, np.float32(self._config.max_range))  # -inf and NaN have no ray
         metres = float(np.nansum(ends, dtype=np.float64))
         return OBLIQUE * metres / self._config.voxel_size
@@ -116,11 +116,11 @@ class Ray:
     def _in_time(self, image: DepthImage) -> DepthImage:
         """Return the image, or its block minima if its rays would cross too many cells for the deadline.
 
-        Raises FrameRefused `no_time` for a camera whose pixels cannot be put together.
+        Raises FrameRefused `no_time` for a camera whose pixels cannot be merged.
         """
         steps = self._steps(image)
-        if steps > SLOW_STEPS and not self._told:
-            self._told = True
+        if steps > SLOW_STEPS and not self._warned:
+            self._warned = True
             line = (
                 f"integrator {self._config.integrator} follows rays through {steps / 1e6:,.0f} million cells of "
                 f"{self._config.voxel_size:g} m for one image, which is far from real time; "
@@ -137,11 +137,11 @@ class Ray:
         raise FrameRefused("no_time", f"its rays cross {steps / 1e6:,.0f} million cells; {cure}")
 
     def _larger(self, image: DepthImage, steps: float, most_ms: float) -> int:
-        """Return by how much larger pixels must be for a frame of so many steps to take no longer than that."""
+        """Return the factor by which pixels must grow for a frame of `steps` cells to take at most `most_ms`."""
         ends = np.minimum(image.depth_m, np.float32(self._config.max_range))
         pixel = (image.camera.binning / image.camera.focal_px) ** 2
         metres3 = float(np.nansum(ends**3, dtype=np.float64)) / 3 * pixel
-        blocks = 2 * metres3 / (SIDE * self._config.voxel_size) ** 3  # those at its faces are seen in part
+        blocks = 2 * metres3 / (SIDE * self._config.voxel_size) ** 3  # twice: blocks at its faces are seen in part
         larger = 1
         while (
             steps / larger**2 / STEPS_PER_MS + min(steps / larger**2 / SIDE, blocks) / BLOCKS_PER_MS > most_ms
@@ -153,9 +153,9 @@ class Ray:
     def _follow(
         self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, part: slice, chunks: int
     ) -> None:
-        """Follow the rays of some rows; the first of them reports which thread's memory to use.
+        """Follow the rays of some rows; the number of the first row selects the thread's memory.
 
-        chunks: parts between which Ctrl-C is heard.
+        chunks: parts between which Ctrl-C is checked.
         """
         pool = self._pools[part.start]
         pool.clear()
@@ -179,14 +179,14 @@ class Ray:
 class Line(Ray):
     """Evidence by line drawing: one cell in each layer along a ray's longest axis (Chien 2020, Alg 1).
 
-    Faster than casting, but cells that a ray only grazes are left out.
+    Faster than casting, but it skips cells that a ray only grazes.
     """
 
     _kernel = staticmethod(_ray.draw)
 
 
 def merged(pools: list[BlockPool], adds: bool) -> BlockPool:
-    """Put the evidence of several threads into the first one's pool: sums (`adds`), or the strongest; return it."""
+    """Merge the evidence of several threads into the first one's pool: sums (`adds`), or the strongest; return it."""
     first, *others = pools
     for other in others:
         places = first.insert(other.coords[: len(other)])
@@ -195,7 +195,7 @@ def merged(pools: list[BlockPool], adds: bool) -> BlockPool:
 
 
 class _Eye(NamedTuple):
-    """Tools of one camera: its sensor table, the same with both signs together, and scratch for each thread."""
+    """Tools of one camera: its sensor table, the same table with both signs together, and scratch for each thread."""
 
     table: KernelTable
     look_up: NDArray[np.int32]
@@ -210,28 +210,29 @@ def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _
 
 
 class Lanes(NamedTuple):
-    """State of the lanes, one number each. Depths along the optical axis in metres, places in cells from its block."""
+    """State of the lanes, one number each. Depths are along the optical axis in metres, positions in cells from the
+    camera's block."""
 
     column: Floats  # x/z of the ray
     depth: Floats  # measured depth, NO_RETURN for nothing up to the maximum range
     end: Floats  # depth at which the ray ends, negative for a lane without a ray
     entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
     row: Ints  # row of the sensor table
-    columns: Floats  # table columns a metre
+    columns: Floats  # table columns per metre
     reach: Floats  # half width of the sensor table's row
-    x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
+    x: Floats  # the face through which the ray leaves its cell along x: whole numbers, kept as floats
     y: Floats
     z: Floats
-    per_x: Floats  # depth one cell takes along each axis; for line drawing, cells one metre of depth takes
+    per_x: Floats  # depth per cell along each axis; for line drawing, cells per metre of depth
     per_y: Floats
     per_z: Floats
     hit: Keys  # key of the cell that holds the measured point, -1 without one
-    cell: Keys  # key of the cell the ray goes into next
-    key: Keys  # key of the cell that is given evidence in this step
-    middle: Floats  # depth in the middle of the ray inside it, NOWHERE for no evidence
-    place: Ints  # where this stands in the sensor table, then the number there
+    cell: Keys  # key of the cell that the ray enters next
+    key: Keys  # key of the cell that gets evidence in this step
+    middle: Floats  # depth in the middle of the ray's path through it, NOWHERE for no evidence
+    place: Ints  # its index in the sensor table, then the number there
     passed: Ints  # the same for the largest loss
-    gain: Ints  # and the evidence
+    gain: Ints  # the evidence
     within: Ints  # sums of gains of earlier lanes of the same group
     groups: Ints  # sums of gains of earlier groups
     bit: Ints  # the lane's own bit: 1, 2, 4
@@ -241,7 +242,7 @@ class Memory(NamedTuple):
     """Cache of recently found blocks, so that most need no hash look-up: (2^MEMORY_BITS,) each."""
 
     block: NDArray[np.int64]  # key of its first cell, -1 for none
-    place: NDArray[np.int64]  # its place in the pool
+    place: NDArray[np.int64]  # its index in the pool
 
 
 def make_lanes(wide: bool) -> Lanes:

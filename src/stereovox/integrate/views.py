@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, poses and sensor tables as kernels take them: tuples of float32 numbers and arrays; and their limits."""
+"""Cameras, poses and sensor tables as kernels take them, tuples of float32 numbers and arrays; and their limits."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from stereovox.sensors.noise import PoseNoise, RangeNoise
 CACHE_LINE = 64
 """Bytes."""
 MAX_CAMERAS, MAX_PIXELS = 16, 1 << 26
-"""Cameras whose tools are cached, and pixels of all of them; beyond, as with a zoom lens, the cache is emptied."""
+"""Most cameras whose tools are cached, and pixels of all; beyond that, as with a zoom lens, the cache is emptied."""
 WINDOW_SHARE = 0.27
 """Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
 
-Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
+Chosen so that a cell is cleared if any ray passes through it, as in exact ray casting (see docs/integrators.md).
 """
 RIM_SHARE = 0.35
 """`rim_share` of the image of a pinhole camera."""
 MIN_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
-"""Blocks that a camera with any image may see, and more for each pixel."""
+"""Most blocks that a camera may see: a base for any image, and more per pixel."""
 MAX_BLOCKS = 1 << 21
-"""Most blocks of one frame: 10^9 cells. Their places fit into 22 bits (`_hits.scatter`)."""
+"""Most blocks of one frame: 10^9 cells. Their indices fit into 22 bits (`_hits.scatter`)."""
 CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
 CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
 """(3, 512) centres of a block's cells from its corner, in cells."""
@@ -47,14 +47,14 @@ Tools = TypeVar("Tools")
 
 
 def aligned(length: int, dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros (length,) that begin with a line of the processor's cache: vectors across two take twice as long."""
+    """Return zeros (length,) that begin at a cache line: vectors across two lines take twice as long."""
     room = np.zeros(length * np.dtype(dtype).itemsize + CACHE_LINE, np.uint8)
     start = -room.ctypes.data % CACHE_LINE
     return room[start : start + length * np.dtype(dtype).itemsize].view(dtype)
 
 
 class PerCamera(Generic[Camera, Tools]):
-    """Cache of the tools for each camera, made when the camera is first seen."""
+    """Cache of the tools of each camera, made when the camera is first seen."""
 
     def __init__(self, make: Callable[[Camera], Tools]):
         self._make = make
@@ -63,7 +63,7 @@ class PerCamera(Generic[Camera, Tools]):
 
     def __getitem__(self, camera: Camera) -> Tools:
         last = self._last
-        if last is None or last[0] is not camera:  # mostly it is the same: to find its hash takes longer
+        if last is None or last[0] is not camera:  # mostly it is the same, and hashing takes longer
             self._last = last = camera, self._find(camera)
         return last[1]
 
@@ -84,20 +84,20 @@ class KernelTable(NamedTuple):
     clear: NDArray[np.int32]  # (rows, columns) negative evidence, 0 elsewhere; column 0 exactly the free value
     mark: NDArray[np.int32]  # (rows, columns) positive evidence next to the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
-    passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is looked through; negative
-    columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
+    passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is seen through; negative
+    columns_per_metre: NDArray[np.float32]  # (rows,) table columns per metre
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
     safe: NDArray[np.float32]  # (rows + 1,) nearest z that is not plainly free for some later row
     before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are plainly free this far before a measurement
     behind: np.float32  # metres behind a measurement where negative evidence ends
     rows_per_metre: np.float32
     blind: np.float32  # depth in metres up to which nothing is cleared
-    free: np.int32  # evidence far before a measurement, where `passed` allows it
+    free: np.int32  # evidence far before a measurement, if `passed` allows it
     marks: bool  # whether there is any positive evidence next to the hit
 
 
 class Rays(NamedTuple):
-    """The rays of any camera at its pose, in metres relative to the corner of the block it stands in.
+    """The rays of any camera at its pose, in metres relative to the corner of the camera's block.
 
     If the sides of a cell differ, the world is stretched to make cells cubes of `voxel_size`; depths stay metres.
     """
@@ -111,7 +111,7 @@ class Rays(NamedTuple):
 
 
 class View(NamedTuple):
-    """A pinhole camera at its pose, in metres relative to the corner of the block it stands in; as in `Rays`."""
+    """A pinhole camera at its pose, in metres relative to the corner of the camera's block; as in `Rays`."""
 
     rotation: NDArray[np.float32]  # (3, 3) world to camera
     forward: NDArray[np.float32]  # (3, 3) as in `Rays`
@@ -125,7 +125,7 @@ class View(NamedTuple):
     voxel_size: np.float32
     max_range: np.float32
     spread: np.float32  # window tile size in pixels times depth
-    rim: NDArray[np.float32]  # (2,) border to the sides and above within which cells count as seen, pixels times depth
+    rim: NDArray[np.float32]  # (2,) margin in u and v within which cells count as seen, pixels times depth
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
@@ -137,7 +137,7 @@ def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCame
 
 
 def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> KernelTable:
-    """Return `table` as kernels read it; up to depth `blind` in metres nothing is cleared."""
+    """Return `table` in the form that kernels read; up to depth `blind` in metres nothing is cleared."""
     units = to_units(table.log_odds)
     clear, mark = np.minimum(units, 0), np.maximum(units, 0)
     free = int(units[0, 0])
@@ -162,7 +162,7 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> Ke
 
 
 def _before(edges: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return, for z up to each row's end, the largest reach of all rows that can reach back so far."""
+    """Return, for z up to each row's end, the largest reach of all rows that can reach back that far."""
     ends = np.append(edges[1:], np.inf)
     reaches_back = ends[:, None] + reach >= edges
     return (1.001 * np.where(reaches_back, reach, 0).max(axis=1)).astype(np.float32)
@@ -175,12 +175,12 @@ def _behind(clear: NDArray[np.int32], reach: NDArray[np.float64]) -> np.float32:
 
 
 def origin_block(T_world_camera: Transform, config: Config) -> NDArray[np.int64]:
-    """Return the block (3,) the camera stands in; kernels count blocks and metres from there to keep float32 exact."""
+    """Return the camera's block (3,); kernels count blocks and metres from there to keep float32 exact."""
     return np.floor(T_world_camera[:3, 3] / np.multiply(SIDE, config.cell)).astype(np.int64)
 
 
 def check_place(T_world_sensor: Transform, config: Config) -> None:
-    """Raise FrameRefused `pose_too_far` if a sensor that stands there sees cells that no map can have."""
+    """Raise FrameRefused `pose_too_far` if a sensor at this pose sees cells that no map can have."""
     limit = INDEX_LIMIT - (2 << _cells.WIDE)
     if not (np.abs(T_world_sensor[:3, 3]) < limit * np.array(config.cell)).all():
         detail = f"the pose is more than {limit} cells from the map's origin; subtract an offset, or use larger cells"
@@ -202,9 +202,9 @@ def _stretch(config: Config) -> NDArray[np.float64]:
 
 
 class Views:
-    """Makes the kernel views of one pinhole camera; a view holds until the next is made.
+    """Makes the kernel views of one pinhole camera; a view is valid until the next is made.
 
-    rim_share: a cell still counts as inside the image when its centre lies this share of its size outside.
+    rim_share: a cell counts as inside the image if its centre is at most this share of its size outside.
     """
 
     def __init__(self, camera: PinholeCamera, config: Config, rim_share: float = RIM_SHARE):
@@ -238,7 +238,7 @@ class Views:
         return self._view.spread
 
     def at(self, T_world_camera: Transform) -> View:
-        """Return the view from this pose; `block` is then the block (3,) the camera stands in."""
+        """Return the view from this pose; `block` is then the camera's block (3,)."""
         view = self._view
         written = view.rotation, view.forward, view.position, view.sides, view.steps
         _cells.aim(np.ascontiguousarray(T_world_camera, float), *self._given, self.block, *written)
@@ -254,7 +254,7 @@ def check_view(camera: VirtualCamera, config: Config) -> None:
 
 
 def check_blocks(blocks: int, camera: VirtualCamera) -> None:
-    """Raise FrameRefused `view_too_large` for evidence on more blocks than can be kept, or than fit the image."""
+    """Raise FrameRefused `view_too_large` for evidence on more blocks than can be kept, or than suit the image."""
     most = min(MAX_BLOCKS, _fitting_blocks(camera))
     if blocks > most:
         raise FrameRefused("view_too_large", f"the frame has evidence on more than {CELLS * most:.2g} cells: {CURE}")
@@ -283,9 +283,9 @@ def camera_rays(camera: VirtualCamera) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def farthest_cells(camera: VirtualCamera, reach: float, config: Config) -> float:
-    """Return how many cells from its block's corner a camera can see at most, at depths up to `reach` metres.
+    """Return the most cells from its block's corner that a camera can see, at depths up to `reach` metres.
 
-    And a cell beyond: points count as hits though they lie behind the middle of the farthest cells looked at.
+    One cell is added: points count as hits even behind the middle of the farthest cells.
     """
     columns, rows = camera_rays(camera)
     corner = np.hypot(np.abs(columns).max(), np.hypot(*rows.T).max())

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that run now: images meet their poses, enter one map, and outputs follow it."""
+"""Live cameras: images get their poses and enter one map, which outputs follow."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long images take from the camera into the map, and until all outputs of the map know of them."""
+"""The latency of images from the camera into the map, and to all outputs of the map."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STAMP, ARRIVAL = "stamp", "arrival"
 
 
 class Latency:
-    """Milliseconds from the stamp of each image that was mapped, or if that is by another clock, its arrival.
+    """Milliseconds since the stamp of each mapped image, or since its arrival if the stamp is by another clock.
 
     Args:
         moment: Returns when the newest image was taken and arrived.
@@ -56,11 +56,11 @@ class Latency:
 
 
 class _Mark:
-    """An observer that takes note of the time."""
+    """An observer that records the time."""
 
     def __init__(self, note: Callable[[UpdateReport], None]):
         self._note = note
 
     def after(self, frame: Any, report: UpdateReport) -> None:
-        """Take note of a frame."""
+        """Record a frame."""
         self._note(report)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of a map while it grows: a 2-D map in files, and the distances all round the body.
+"""Outputs of a growing map: a 2-D map in files, and the distances in all directions around the body.
 
 Each is an observer of the run: `after` for each frame, `finish` once the last one is in the map, `close` at the end.
 """
@@ -33,27 +33,27 @@ from stereovox.sources.poses.live_poses import LivePoses
 GRID_S = 1.0
 """Seconds between two writes of the 2-D map."""
 STEP_DEG = 2.0
-"""Width of a cell of the spherical grid if the settings do not choose one."""
+"""Width of a cell of the spherical grid unless the settings choose one."""
 
 
 class Output(Protocol):
-    """An observer that has something to finish, and something to close."""
+    """An observer with work at the end of a run."""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
         """Process a frame that was offered to the map."""
         ...
 
     def finish(self) -> None:
-        """Show or write what there is after the last frame."""
+        """Show or write the result after the last frame."""
         ...
 
     def close(self) -> None:
-        """End; whether the run ended well or not."""
+        """Release everything, whether the run ended well or not."""
         ...
 
 
 class GridFile:
-    """Keeps the 2-D map of a growing map in map_server files, written anew in a thread of its own.
+    """Keeps the 2-D map of a growing map in map_server files, rewritten in a thread of its own.
 
     While the map is stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete. Unknown
     cells are never free.
@@ -66,8 +66,8 @@ class GridFile:
         notify: Called with a line if the files could not be written, and once if the map shows no floor.
 
     Attributes:
-        written: How often they were.
-        failure: Why the files do not hold the newest 2-D map; "" when they do.
+        written: How often the files were written.
+        failure: Why the files do not hold the newest 2-D map; "" if they do.
 
     Raises:
         StereovoxError: The file cannot be written, or the map is not level.
@@ -109,11 +109,11 @@ class GridFile:
         self._worker.shutdown()
 
     def _current(self) -> bool:
-        """Return whether the map is fresh enough to be written, and tell the user once if it is not."""
+        """Return whether the map is fresh enough to be written; notify the user once if it is not."""
         why = context_of(self._mapper).stale
         was, self._stale = self._stale, bool(why)
         if why and not was:
-            self._notify(f"{self._file}: is not written anew, the map is {why}")
+            self._notify(f"{self._file}: is not updated, since the map is {why}")
         return not self._stale
 
     def _write(self) -> None:
@@ -136,7 +136,7 @@ class GridFile:
             self._fail(str(error))
 
     def _fail(self, why: str) -> None:
-        """Tell the user once of each thing that is wrong: a full disk is, every second."""
+        """Notify the user of each problem once: a full disk recurs every second."""
         why = why if why.startswith(f"{self._file}:") else f"{self._file}: {why}"
         if why != self.failure:
             self._notify(why)
@@ -147,14 +147,14 @@ class LiveSphere:
     """The distances to the nearest surfaces in all directions from the body, by the last image of each camera.
 
     Args:
-        config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees if they say nothing.
+        config: Settings of the map; cells are `sphere.step_deg` wide, 2 degrees by default.
         mounts: T_body_camera (4, 4) by the name of the sensor; body x forward, y left, z up.
-        picture: PNG to draw at the end; None: none.
-        mapper: The mapper that takes the images; None: how old they are is not judged.
-        poses: Where newer poses of the body come from; None: those of the images are the newest.
+        picture: PNG to draw at the end; None for no picture.
+        mapper: The mapper that takes the images; None: their age is not checked.
+        poses: Source of newer poses of the body; None: the poses of the images are the newest.
 
     Attributes:
-        failure: Why there is no picture, if one was requested; "" when there is.
+        failure: Why a requested picture is missing; "" if there is no problem.
 
     Raises:
         StereovoxError: The picture cannot be written.
@@ -177,13 +177,13 @@ class LiveSphere:
         self.failure = ""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
-        """Take in what a camera sees, unless the map refused it; clouds of lidars are left out."""
+        """Accumulate the image of a camera, unless the map refused it; lidar clouds are skipped."""
         if report.refused or isinstance(frame, Cloud):
             return
         try:
             image = self._pipeline.checked(self._pipeline.matched(frame))
         except FrameRefused:
-            return  # the map took it at another quality
+            return  # the map accepted it at another quality
         mount = self._mounts[frame.sensor]
         T_world_body = image.T_world_sensor @ inverse(mount)
         self._last[frame.sensor] = accumulate(image, mount, self._config, self._layout), T_world_body
@@ -194,18 +194,18 @@ class LiveSphere:
         return bool(self._last)
 
     def grid(self) -> tuple[SphereGrid, int]:
-        """Return the grid of all cameras from where the body is by the newest pose, and its time in nanoseconds.
+        """Return the grid of all cameras, seen from the newest pose of the body, and its time in nanoseconds.
 
-        Each cell has its own stamp: what another camera saw before is older. Once the run has ended this is the grid of
-        the last image, whenever it is asked for.
+        Each cell has its own stamp: views of other cameras may be older. Once the run has ended, it is always the grid
+        at the last image.
 
         Raises:
-            StereovoxError: Nothing has been seen so far, or the map is stale or lost (`Mapper.health`).
+            StereovoxError: Nothing has been seen yet, or the map is stale or lost (`Mapper.health`).
         """
         if not self._last:
-            raise StereovoxError("no image has been mapped yet; ask again later")
+            raise StereovoxError("no image has been mapped yet; try again later")
         if self._mapper is not None and not self._finished and (why := context_of(self._mapper).stale):
-            raise StereovoxError(f"the distances are old, the map is {why}; ask again later")
+            raise StereovoxError(f"the distances are old, since the map is {why}; try again later")
         now = None if self._poses is None or self._finished else self._poses.newest
         return together(self._last, now[:2] if now is not None and np.isfinite(now.T_world_body).all() else None)
 

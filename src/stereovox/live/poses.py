@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where poses of a live run come from, by name."""
+"""The sources of poses for a live run, by name."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ POSES = {
     "t265": "stereovox.sources.poses.pose_stream:T265",
     "mavlink": "stereovox.mavlink.stream:MavlinkPoses",
 }
-"""Streams of poses (`PoseStream`), asked in this order, then entry points in the group `stereovox.poses`."""
+"""Streams of poses (`PoseStream`), tried in this order, then entry points in the group `stereovox.poses`."""
 
 
 def open_poses(where: str) -> PoseStream:
-    """Return the stream of poses that `where` names; it is not started.
+    """Return the stream of poses that `where` names, not yet started.
 
     Raises:
-        SourceError: It names none, or one that cannot be used.
+        SourceError: It names no stream, or one that cannot be used.
     """
     for name in registry.names("poses", POSES):
         kind = registry.find("poses", POSES, name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record depth images and poses next to mapping them, so that the same can be mapped again."""
+"""Record depth images and poses while they are mapped, so that they can be mapped again."""
 
 from __future__ import annotations
 
@@ -25,32 +25,30 @@ from stereovox.sources.imu import Imu
 WORLD, BODY = "odom", "base_link"
 """Frames of the recording, as REP 105 names them: poses may drift."""
 WAITING = 60
-"""Images that wait to be written; more are not recorded, and counted."""
+"""Most images that wait to be written; further ones are skipped and counted."""
 LOOK_S, SYNC_S = 0.2, 5.0
-"""Seconds between looks for the end, and after which what is written is safe from a loss of power."""
+"""Seconds between checks for the end, and between syncs, after which written data survive a loss of power."""
 ENDINGS = (".mcap", ".bag", ".db3")
 
 
 class Recorder:
     """Writes images, poses of the body and mounts to a bag, in a thread of its own; an output of a live run.
 
-    Topics: `/NAME/depth/image_rect_raw` and `camera_info` next to it, `/tf` (odom to base_link at the time of each
-    image
-    that has a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` if pictures are taken
-    along, and `/NAME/imu` of a camera that has one. Depth in whole millimetres, or float metres if the source has
-    these. Images that the map refused are recorded, too.
+    Topics: `/NAME/depth/image_rect_raw` and its `camera_info`, `/tf` (odom to base_link at the time of each image with
+    a pose), `/tf_static` (mounts), `/NAME/color/image_raw` with its `camera_info` if color images are taken too, and
+    `/NAME/imu` of a camera that has one. Depth is in whole millimetres, or in float metres if the source's is. Images
+    that the map refused are recorded too.
 
     Args:
-        file: `.mcap`, `.bag` or `.db3`; it is complete at the end, and there is none before. An `.mcap` grows in
-            `FILE.mcap.XXXXXX.unfinished/`, from where it can be read after a kill or a full disk.
+        file: `.mcap`, `.bag` or `.db3`; it appears, complete, at the end. An `.mcap` grows in
+            `FILE.mcap.XXXXXX.unfinished/`, where it can be read after a kill or a full disk.
         mounts: T_body_camera (4, 4) by the name of the sensor.
         imus: IMUs by the name of the sensor.
         notify: Called with a line if something cannot be recorded.
 
     Attributes:
-        counts: `images` that are recorded, `skipped`: that came while too many waited, `unsuitable`: other than whole
-            depth images.
-        failure: Why the recording is not at `file`, and where what was recorded before is; "" while nothing is wrong.
+        counts: `images` that are recorded, `skipped` because too many waited, `unsuitable`: not whole depth images.
+        failure: Why the recording is not at `file`, and where its first part is; "" while there is no problem.
 
     Raises:
         StereovoxError: The file has another ending, or cannot be written.
@@ -66,7 +64,7 @@ class Recorder:
         if Path(file).suffix.lower() not in ENDINGS:
             raise StereovoxError(f"{file}: end the name of a recording in {' or '.join(ENDINGS)}")
         if len({topic(name) for name in mounts}) < len(mounts):
-            raise StereovoxError(f"{file}: cameras {', '.join(mounts)} have one topic; name them by letters and digits")
+            raise StereovoxError(f"{file}: cameras {', '.join(mounts)} share a topic; name them by letters and digits")
         self.file, self.counts, self.failure = Path(file), Counter[str](), ""
         self._mounts, self._imus, self._notify = mounts, imus or {}, notify
         self._heard: dict[str, int] = {}
@@ -79,7 +77,7 @@ class Recorder:
         self._thread.start()
 
     def after(self, frame: Any, report: UpdateReport) -> None:
-        """Hand an image over to be written."""
+        """Queue an image for writing."""
         if not isinstance(frame, Frame) or not frame.depth.size or not isinstance(frame.camera, PinholeCamera):
             self.counts["unsuitable"] += 1
             return
@@ -89,11 +87,11 @@ class Recorder:
             self.counts["skipped"] += 1
 
     def finish(self) -> None:
-        """Write what waits, and complete the recording."""
+        """Write all waiting images, and complete the recording."""
         self.close()
 
     def close(self) -> None:
-        """Write what waits, and complete the recording."""
+        """Write all waiting images, and complete the recording."""
         self._ended.set()
         self._thread.join()
 
@@ -115,19 +113,19 @@ class Recorder:
                 self._bag.complete()
             else:
                 self._bag.__exit__(StereovoxError, None, None)  # nothing to keep
-                self.failure = f"{self.file}: no image came that could be recorded; nothing is recorded"
-        except Exception as error:  # whatever it is, the user is informed, and nobody waits for this thread
+                self.failure = f"{self.file}: no suitable image arrived; nothing is recorded"
+        except Exception as error:  # whatever it is, the user is notified, and nobody waits for this thread
             why = error if isinstance(error, StereovoxError) else f"{self.file}: {type(error).__name__}: {error}"
             self.failure = f"{why}; {self._left()}"
-            self._notify(f"{self.failure}, mapping goes on")
+            self._notify(f"{self.failure}; mapping continues")
             self._drain()
 
     def _left(self) -> str:
-        """Say what is left of a recording that ended early, and leave it."""
+        """Keep the rest of a recording that ended early, and return a phrase that names it."""
         left = self._bag.leave() if self.counts["images"] else ""
         if not left:
             self._bag.__exit__(StereovoxError, None, None)
-        return f"what was recorded before is in {left}" if left else "nothing is recorded"
+        return f"the part recorded before is in {left}" if left else "nothing is recorded"
 
     def _write(self, frame: Frame) -> None:
         name, stamp_ns = frame.sensor, frame.stamp_ns
@@ -144,7 +142,7 @@ class Recorder:
             return
         T = np.asarray(frame.photo.T_sensor_camera, float)
         beside = optical(name) if np.array_equal(T, np.eye(4)) else f"{topic(name)}_color_optical_frame"
-        with suppress(FrameRefused):  # a picture that cannot be read is none
+        with suppress(FrameRefused):  # an unreadable picture is skipped
             self._bag.photo(frame, f"/{topic(name)}/color/image_raw", beside)
             if beside != optical(name) and name not in self._pictured:
                 self._bag.fixed(optical(name), beside, T)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cameras run together, where each is mounted and by which clock, and where poses come from; `live.toml`."""
+"""The cameras of a live run, their mounts and clocks, and the source of poses; `live.toml`."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class LiveCamera:
     """A camera of a live run.
 
     Attributes:
-        source: A live camera (`realsense:SERIAL`), a recording or simulation that is played at its own pace as if it
-            were one, or a `Stream` of your own.
-        name: Its name in the map, in reports and in recordings; "": that of its source.
+        source: A live camera (`realsense:SERIAL`), a recording or simulation that is played at its own pace like one,
+            or a `Stream` of your own.
+        name: Its name in the map, in reports and in recordings; "": the name of its source.
         T_body_camera: (4, 4) float64, maps the camera's optical frame (x right, y down, z forward) into the body's
-            (x forward, y left, z up). Without it the camera is at the body's origin and looks ahead. Of a lidar it is
-            that of a camera in its place that looks along its x axis.
+            (x forward, y left, z up). Without it the camera is at the body's origin and looks ahead. For a lidar, give
+            the mount of a camera in its place that looks along its x axis.
         clock_offset_s: Image stamp minus the stamp of a pose at the same moment, in seconds.
 
     Raises:
@@ -51,7 +51,7 @@ class LiveCamera:
 
     def __post_init__(self) -> None:
         if not isinstance(self.source, str | Path):
-            stream_of(self.source)  # raises for what is none
+            stream_of(self.source)  # raises if it is no stream
         T = matrix_of(self.T_body_camera)
         if rigidity_error(T) > TOLERANCE:
             rows = "four rows of four numbers, a rotation and metres, below them 0 0 0 1"
@@ -62,13 +62,13 @@ class LiveCamera:
 
     @property
     def title(self) -> str:
-        """Its name, or that of its source."""
+        """Its name, or the name of its source."""
         return self.name or (str(self.source) if isinstance(self.source, str | Path) else self.source.name)
 
 
 @dataclass(frozen=True, eq=False)
 class LiveSetup:
-    """What a `live.toml` says: the cameras, and where poses come from ("": nothing said)."""
+    """The contents of a `live.toml`: the cameras, and the source of poses ("" if not given)."""
 
     cameras: tuple[LiveCamera, ...]
     poses: str = ""
@@ -77,9 +77,9 @@ class LiveSetup:
 def mount_of(numbers: ArrayLike) -> Transform:
     """Return T_body_camera (4, 4) of a mount `x y z roll pitch yaw` or `x y z qx qy qz qw`.
 
-    Metres along the body's axes (x forward, y left, z up); degrees (roll about x, then pitch about y, then yaw about z,
-    the body's axes) or a quaternion, by which a camera that looks ahead is turned. All zeros: it looks ahead; pitch 30:
-    30 degrees down; yaw 90: to the left.
+    Metres along the body's axes (x forward, y left, z up). Degrees (roll about x, then pitch about y, then yaw about z,
+    the body's axes) or a quaternion turn a camera that looks ahead: zeros keep it so, pitch 30 turns it 30 degrees
+    down, yaw 90 to the left.
     Raises StereovoxError for anything else.
     """
     try:
@@ -90,7 +90,7 @@ def mount_of(numbers: ArrayLike) -> Transform:
         raise StereovoxError("a mount is x, y, z, roll, pitch, yaw in metres and degrees, or x, y, z, qx, qy, qz, qw")
     if len(values) == 7:
         if np.linalg.norm(values[3:]) < 1e-6:
-            raise StereovoxError("a mount needs a quaternion of a length above zero")
+            raise StereovoxError("a mount needs a quaternion that is not zero")
         return from_quaternion(values[:3], values[3:]) @ T_BODY_OPTICAL
     return from_quaternion(values[:3], Rotation.from_euler("xyz", values[3:], degrees=True).as_quat()) @ T_BODY_OPTICAL
 
@@ -99,7 +99,7 @@ def read_live(path: str | Path) -> LiveSetup:
     """Read a `live.toml`: `poses`, and a table `[[camera]]` for each camera.
 
     Keys of a camera: `source`, `name`, `mount` (six or seven numbers, see `mount_of`) or `T_body_camera` (four rows of
-    four), `clock_offset_s`. Recordings are looked for from the file's own folder on.
+    four), `clock_offset_s`. Relative paths of recordings start at the file's own folder.
 
     Raises:
         SourceError: One line that names file, camera and key.
@@ -109,7 +109,7 @@ def read_live(path: str | Path) -> LiveSetup:
         _check_keys(table, TOP)
         tables = table.get("camera")
         if not isinstance(tables, list) or not tables or not all(isinstance(one, dict) for one in tables):
-            raise SourceError("holds no camera; write a table [[camera]] for each")
+            raise SourceError("holds no camera; write one table [[camera]] per camera")
         cameras = [_camera(number, one, folder) for number, one in enumerate(tables, 1)]
         return LiveSetup(check_cameras(cameras), _word(table, "poses") if "poses" in table else "")
     except StereovoxError as error:
@@ -117,7 +117,7 @@ def read_live(path: str | Path) -> LiveSetup:
 
 
 def check_cameras(cameras: Sequence[LiveCamera]) -> tuple[LiveCamera, ...]:
-    """Return the cameras; raises SourceError if missing, too many, or two of one name."""
+    """Return the cameras; raises SourceError for none, for too many, or for two with one name."""
     names = [camera.title for camera in cameras]
     if not 1 <= len(names) <= MAX_CAMERAS:
         raise SourceError(f"{len(names)} cameras; give 1 to {MAX_CAMERAS}")

@@ -41,12 +41,12 @@ OUTPUTS = ("grid", "heights", "sphere", "record", "view", "mavlink", "send_pose"
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(MapOptions):
-    """Options of `map_live`, in addition to those of `MapOptions`.
+    """Options of `map_live`, in addition to `MapOptions`.
 
     Attributes:
-        poses: `track`: the first camera is tracked by its own images; `given`: those that images come with; a name of a
+        poses: `track`: the first camera is tracked by visual odometry; `given`: the poses of the images; the name of a
             stream (`t265`, `udp://:5005`, `tcp://HOST:5005`), a `PoseStream`, or a `LivePoses` that you fill. None:
-            as the `live.toml` says, else given where all images have poses, else track.
+            as in the `live.toml`, else given if all images have poses, else track.
         resume: Continue the map at `out`; the poses must be in its world.
         wait_s: Seconds that an image waits for its pose.
         seconds: How long to map.
@@ -60,16 +60,16 @@ class LiveOptions(MapOptions):
 
 @dataclass(frozen=True)
 class LiveResult(RunResult[VoxelMap]):
-    """What became of a live run.
+    """The result of a live run.
 
     Attributes:
         map: The map, as saved.
-        out: Where it was saved.
+        out: The path it was saved to.
         reports: One report for each image that was offered to the map, in order.
         stopped: Whether a signal ended it (Ctrl-C, SIGTERM or SIGHUP), as is usual.
-        live: Latency, images and poses by where they came from, and outputs: the part `live` of `summary`.
+        live: Latency, images and poses by source, and outputs: the part `live` of `summary`.
         poses: `given`, `track`, or the name of the stream of poses.
-        failures: What was to be written next to the map and is not, a line each.
+        failures: Outputs that could not be written, a line each.
     """
 
     stopped: bool
@@ -81,8 +81,8 @@ class LiveResult(RunResult[VoxelMap]):
         """Summarise the run.
 
         Returns:
-            The numbers of `stereovox live --json`: those of `map`, and `live`; `not_written` if something was to be
-            and is not.
+            The numbers of `stereovox live --json`: those of `map`, and `live`; `not_written` if an output could not be
+            written.
         """
         came = sum(counts["received"] for counts in self.live["cameras"].values())
         found = {**self._summary(came, "images"), "poses": self.poses, "live": self.live}
@@ -98,7 +98,7 @@ class LiveRun(Run[MapRun, LiveResult]):
     Attributes:
         mapper: The mapper, once entered.
         stream: The images with their poses.
-        sphere: The distances all round, if that output was added.
+        sphere: The distances in all directions, if that output was added.
         page: Link to the page, if that output was added; else "".
         outputs: The outputs that were added.
 
@@ -132,7 +132,7 @@ class LiveRun(Run[MapRun, LiveResult]):
             self._cameras, self._opened, wait_s=options.wait_s, seconds=options.seconds, notify=self._notify
         )
         if options.resume and self.stream.tracked:
-            raise StereovoxError(f"{self.out}: a tracked camera does not know where in it it is; begin a new map")
+            raise StereovoxError(f"{self.out}: a tracked camera cannot be located in a saved map; begin a new one")
         alike = {name: getattr(options, name) for name in (*MapOptions.names(), "resume")}
         self._run = stack.enter_context(MapRun(self.stream, self.out, poses=GIVEN, **alike, **options.settings))
         self.mapper = self._run.mapper
@@ -208,7 +208,7 @@ class LiveRun(Run[MapRun, LiveResult]):
         return [self._run]
 
     def _take(self, step: MapRun) -> None:
-        """Map all images: the one step of this run is a run of its own, over the images of all cameras."""
+        """Map all images: the only step of this run is itself a run, over the images of all cameras."""
         self.stream.check = self._check
         outputs = [*self._observers, *self.outputs]
         begin, cpu = perf_counter(), process_time()
@@ -216,7 +216,7 @@ class LiveRun(Run[MapRun, LiveResult]):
             step.finish([self._latency.mapped, *outputs, self._latency.sent, *self._page])
         finally:
             self._took = perf_counter() - begin, process_time() - cpu
-            with ExitStack() as ends:  # one that fails does not keep the others from their end
+            with ExitStack() as ends:  # if one fails, the others still end
                 for output in (*outputs, *self._page)[::-1]:
                     ends.callback(getattr(output, "close", _nothing) if output in outputs else _nothing)
                 for output in (*outputs, *self._page)[::-1]:
@@ -224,7 +224,7 @@ class LiveRun(Run[MapRun, LiveResult]):
 
     def _end(self) -> LiveResult:
         if not self.mapper.map.frames:
-            raise StereovoxError(f"{self.stream.name}: stopped before an image could be mapped, no map is written")
+            raise StereovoxError(f"{self.stream.name}: stopped before an image could be mapped; no map is written")
         seconds, cpu = self._took
         live = {
             "seconds": round(seconds, 3),
@@ -243,7 +243,7 @@ class LiveRun(Run[MapRun, LiveResult]):
         return LiveResult(self.mapper.map, self.out, reports, self.stopped, live, self._poses_word(), failures)
 
     def _pose_came(self) -> None:
-        """Say what time it is by the newest pose, and where the body is."""
+        """Pass on the time and the place of the newest pose of the body."""
         assert self.stream.poses is not None
         newest = self.stream.poses.newest
         if newest is None or newest.stamp_ns == self._newest_ns:
@@ -268,18 +268,18 @@ class LiveRun(Run[MapRun, LiveResult]):
 def map_live(cameras: Cameras, out: str | Path, *, observers: Sequence[Observer] = (), **options: Any) -> LiveResult:
     """Map one or several cameras while they run, until a signal (Ctrl-C, SIGTERM), `seconds`, or they end.
 
-    Each image waits for its pose; one whose pose does not come is refused with the reason, and no pose is guessed. The
+    Each image waits for its pose; if none arrives, the image is refused with the reason, and no pose is guessed. The
     map is saved at regular checkpoints and at the end, as by `map_recording`.
 
     Args:
-        cameras: Name of a camera (`realsense:`) or recording, a `live.toml`, a `Stream`, a `LiveCamera`, or several of
-            these but a `live.toml`.
+        cameras: Name of a camera (`realsense:`) or recording, a `live.toml`, a `Stream`, a `LiveCamera`, or a list of
+            these without a `live.toml`.
         out: Folder of the map to write.
         observers: Called after each image, before the other outputs.
-        **options: Those of `LiveOptions`, outputs as for `LiveRun.add_outputs`, and settings by name, as for `Mapper`.
+        **options: Fields of `LiveOptions`, outputs as for `LiveRun.add_outputs`, and settings by name, as for `Mapper`.
 
     Returns:
-        The map, the report of each image, and how long they took.
+        The map, the report of each image, and latencies.
 
     Raises:
         StereovoxError: One line: invalid cameras, poses, settings or outputs, all cameras failed, or not one image
@@ -292,7 +292,7 @@ def map_live(cameras: Cameras, out: str | Path, *, observers: Sequence[Observer]
 
 
 def _cameras(cameras: Cameras, poses: PosesFrom) -> tuple[Sequence[LiveCamera], PosesFrom]:
-    """Return the cameras, and where poses come from: as was asked for, else as a `live.toml` says."""
+    """Return the cameras, and the source of poses: as requested, else as in a `live.toml`."""
     if isinstance(cameras, LiveCamera):
         return [cameras], poses
     if isinstance(cameras, str | Path):
@@ -306,4 +306,4 @@ def _cameras(cameras: Cameras, poses: PosesFrom) -> tuple[Sequence[LiveCamera], 
 
 
 def _nothing() -> None:
-    """Stand in for what an observer does not have."""
+    """Stand in for a method that an observer lacks."""

@@ -39,16 +39,16 @@ from stereovox.track.stream import follow
 from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
 
 WAIT_S, LATE_S, QUEUE, UNTRACKED = 0.3, 0.25, 40, 2
-"""Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it gives way to newer
-ones; images that wait, for each camera, and for tracking."""
+"""Seconds that an image waits for its pose, and that one with a pose waits for a busy map before it yields to newer
+ones; most images that wait, per camera and for tracking."""
 TICK_S, SOON_S = 0.1, 0.01
-"""Seconds after which a stream without news says so, and after which waiting images are looked at again."""
+"""Seconds after which a stream without news wakes up, and after which waiting images are checked again."""
 REMIND_S = 5.0
 """Seconds without any pose, with bad lines, or without an image of a camera, until the user is informed."""
 HOST_CLOCK_NS = 60_000_000_000
-"""Stamps that are not older than this by the clock of this machine are believed to be by it."""
+"""Stamps that are at most this old by the clock of this machine are taken to be by that clock."""
 REMEMBERED = 300
-"""Arrivals that are remembered for each camera."""
+"""Most arrivals remembered per camera."""
 
 
 class Moment(NamedTuple):
@@ -64,10 +64,10 @@ class Moment(NamedTuple):
 
 @dataclass(eq=False)
 class _Feed:
-    """One camera and what became of its images. offset_ns: what is taken off its stamps. ended: it delivers no more.
+    """One camera and what became of its images. offset_ns: subtracted from its stamps. ended: it delivers no more.
 
-    heard_ns: when its last image came, or it was started; monotonic. told: what was last reported to the user that is
-    wrong. clock: what watches its clock, where poses do not come with images.
+    heard_ns: when its last image arrived, or it was started; monotonic. told: the last problem that was reported to the
+    user. clock: watches its clock, if poses do not come with the images.
     """
 
     camera: LiveCamera
@@ -89,7 +89,7 @@ class _Feed:
 
     @property
     def ahead_ns(self) -> int:
-        """By how much its stamps are ahead of the poses', as far as is known."""
+        """How far its stamps are ahead of the poses', as far as is known."""
         return self.offset_ns - (self.clock.shift_ns if self.clock else 0)
 
     @property
@@ -98,7 +98,7 @@ class _Feed:
 
 
 class _Image(NamedTuple):
-    """An image that waits, and what was known of its stamp when it came."""
+    """A waiting image, and what was known about its stamp when it arrived."""
 
     feed: _Feed
     frame: AnyFrame
@@ -106,31 +106,31 @@ class _Image(NamedTuple):
 
 
 class LiveStream(Stream):
-    """Images of several cameras with their poses, in order of time as far as they have arrived.
+    """Images of several cameras with their poses, in time order as far as they have arrived.
 
     Iterating starts cameras and poses, and stops them. Cameras that are recordings end; the stream ends with the last
     one. A camera that fails does not end the others.
 
     Args:
         cameras: The cameras.
-        poses: `given`: those of the images; `track`: the first camera is tracked by its own images, and the others
-            move with it; or a stream of poses of the body, or a buffer that you fill. None: given if all images
-            have poses, else track.
+        poses: `given`: those of the images; `track`: the first camera is tracked by visual odometry, and the others
+            move with it; or a stream of poses of the body, or a buffer that you fill. None: given if all images have
+            poses, else track.
         wait_s: Seconds that an image waits for its pose.
-        seconds: How long to go on; None: until the cameras end.
+        seconds: Duration; None: until the cameras end.
         notify: Called with each line that a user should see.
 
     Attributes:
         poses: The poses of the body; None with `given`.
         config: Settings, for tracking.
-        check: Called again and again, also while no image comes; an exception of it ends the iteration.
+        check: Called repeatedly, even while no image arrives; an exception in it ends the iteration.
         on_start: Called once cameras and poses have been started.
         on_given: Called with each image of the first camera in its thread, if images bring their poses; None: nothing.
         moment: When the image that was yielded last was taken and arrived.
         mounts: T_body_camera (4, 4) by the name of the camera, which is the `sensor` of its images.
         tracked: Whether the first camera is tracked.
         clouds: Whether one of them is a lidar.
-        imu_use: What tracking made of an IMU, in words.
+        imu_use: How tracking used an IMU, in words.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class LiveStream(Stream):
         notify: Callable[[str], None] = lambda line: None,
     ):
         if not 0 <= wait_s <= 60 or (seconds is not None and not seconds > 0):
-            raise StereovoxError(f"wait_s {wait_s:g}, seconds {seconds}: give at most 60 s, and more than none")
+            raise StereovoxError(f"wait_s {wait_s:g}, seconds {seconds}: give wait_s 0 to 60, and seconds above 0")
         self.config = load_config("default")
         self.check: Callable[[], object] = lambda: None
         self.on_start: Callable[[], object] = lambda: None
@@ -187,9 +187,9 @@ class LiveStream(Stream):
         return {name: imu for name, imu in found.items() if imu is not None}
 
     def counts(self) -> dict[str, Any]:
-        """Return what became of images and poses: by camera `received`, `dropped`, `before_first_pose`; of poses.
+        """Return what became of images, by camera `received`, `dropped`, `before_first_pose`; and counts of poses.
 
-        Of a recording or simulation also how many were `late`: it could not be read or drawn at its pace.
+        For a recording or simulation also how many were `late`: it could not be read or drawn at its pace.
         """
         cameras = {
             feed.name: {
@@ -208,12 +208,12 @@ class LiveStream(Stream):
         return {"cameras": cameras, "poses": {"added": self.poses.added, **dict(self.poses.counts), **more}}
 
     def now_ns(self) -> int | None:
-        """Return the present time by the clock of the poses and of the frames' stamps; None: no camera tells it."""
+        """Return the present time by the clock of the poses and of the frames' stamps; None if no camera shares it."""
         offsets = [feed.offset_ns for feed in self._feeds if feed.host_clock]
         return epoch_ns() - min(offsets) if offsets else None
 
     def mount(self, frame: AnyFrame) -> Transform:
-        """Return T_body_sensor (4, 4) of what took a frame of this stream; of a cloud, from its own axes."""
+        """Return T_body_sensor (4, 4) for the sensor of a frame of this stream; for a cloud, from its own axes."""
         mount = self.mounts[frame.sensor]
         return mount @ T_OPTICAL_BODY if isinstance(frame, Cloud) else mount
 
@@ -222,8 +222,8 @@ class LiveStream(Stream):
         """Why no image has become a frame, in words."""
         early = sum(feed.before_first_pose for feed in self._feeds)
         if self.poses is None or not early:
-            return "no image came"
-        return f"{early} images came, but no pose: {self.poses.where}"
+            return "no image arrived"
+        return f"{early} images arrived, but no pose: {self.poses.where}"
 
     def __iter__(self) -> Iterator[AnyFrame]:
         end = monotonic() + (self._seconds or float("inf"))
@@ -242,7 +242,7 @@ class LiveStream(Stream):
                 thread.start()
                 stack.callback(thread.join, STOPPING_S)
             self.on_start()
-            stack.callback(self._stopped.set)  # called first: the threads stop side by side
+            stack.callback(self._stopped.set)  # called first, so that all threads stop at once
             yield from self._merged(end)
 
     def _merged(self, end: float) -> Iterator[AnyFrame]:
@@ -250,7 +250,7 @@ class LiveStream(Stream):
         while left and monotonic() < end:
             arrival, left = self._next()
             self.check()
-            self._tell()
+            self._report_trouble()
             frame = None if arrival is None else self._framed(arrival)
             if frame is not None:
                 yield frame
@@ -259,7 +259,7 @@ class LiveStream(Stream):
             raise SourceError(failures[0])
 
     def _next(self) -> tuple[Arrival[_Image] | None, bool]:
-        """Return an image whose pose is there or will not come, if any, and whether more may come."""
+        """Return an image whose pose is there or will not arrive, if any, and whether more images may come."""
         with self._change:
             arrival = self._waiting.pop(self._ready)
             if arrival is not None:
@@ -281,12 +281,12 @@ class LiveStream(Stream):
         given_s, mount = feed.camera.clock_offset_s, feed.camera.T_body_camera
 
         def cure(_: object, ahead_s: float) -> str:
-            return f"begin again with --clock-offset (clock_offset_s) {given_s + ahead_s:.3f}"
+            return f"restart with --clock-offset (clock_offset_s) {given_s + ahead_s:.3f}"
 
         return CameraClock(feed.name, poses, self._delays, mount, self.config, self._notify, cure)
 
     def _framed(self, arrival: Arrival[_Image]) -> AnyFrame | None:
-        """Return an image with its pose, or with a fault that says why it has none; None before the first pose."""
+        """Return an image with its pose, or with a fault that says why the pose is missing; None before any pose."""
         feed, image, heard = arrival.content
         frame = replace(image, sensor=feed.name, stamp_ns=arrival.stamp_ns)
         self.moment = feed.moments.pop(image.stamp_ns, Moment(feed.name, None, arrival.arrived_ns))
@@ -307,7 +307,7 @@ class LiveStream(Stream):
         return replace(frame, T_world_sensor=T_world_sensor, fault=None, fault_detail="", pose_off_ns=0)
 
     def _run(self, feed: _Feed) -> None:
-        """Put a camera's images into its queue until it ends or nobody wants more."""
+        """Put a camera's images into its queue until it ends or the stream stops."""
         try:
             with closing(self._tracked(feed) if feed.tracked else self._noted(feed)) as images:
                 for image in images:
@@ -329,7 +329,7 @@ class LiveStream(Stream):
             self._wake()
 
     def _noted(self, feed: _Feed) -> Iterator[AnyFrame]:
-        """Yield a camera's images, and take note when they arrive."""
+        """Yield a camera's images, and record when they arrive."""
         with closing(feed.stream) as images:
             for image in images:
                 arrived_ns, now_ns = monotonic_ns(), epoch_ns()
@@ -372,12 +372,12 @@ class LiveStream(Stream):
         with self._change:
             self._change.notify()
 
-    def _tell(self) -> None:
-        """Tell the user what is wrong: with cameras, at once; with poses, now and then."""
+    def _report_trouble(self) -> None:
+        """Report problems to the user: of cameras, at once; of poses, now and then."""
         for feed in self._feeds:
             said = self._trouble(feed)
             if said and said != feed.told:
-                self._notify(f"{said}; the other cameras go on" if len(self._feeds) > 1 else said)
+                self._notify(f"{said}; the other cameras continue" if len(self._feeds) > 1 else said)
             feed.told = said
         now = monotonic()
         if now < self._remind or self.poses is None:
@@ -385,7 +385,7 @@ class LiveStream(Stream):
         self._remind = now + REMIND_S
         trouble = self._stream.trouble if self._stream is not None else ""
         if not self.poses.added:
-            self._notify(f"{trouble or f'{self.poses.where}: no pose has come yet'}; images wait for the first one")
+            self._notify(f"{trouble or f'{self.poses.where}: no pose has arrived yet'}; images wait for the first one")
         elif trouble and self._stream is not None:
             self._stream.trouble = ""
             self._notify(trouble)
@@ -395,11 +395,11 @@ class LiveStream(Stream):
         if feed.ended:
             return "" if all(one.failure for one in self._feeds) else feed.failure
         silent = monotonic_ns() - feed.heard_ns > 1e9 * REMIND_S
-        return f"{feed.name}: no image has come for {REMIND_S:g} s; is it still connected?" if silent else ""
+        return f"{feed.name}: no image has arrived for {REMIND_S:g} s; is it still connected?" if silent else ""
 
 
 class _LateTracker:
-    """A tracker that is made with the first image, which shows what is level."""
+    """A tracker that is made with the first image, which shows the up direction."""
 
     def __init__(self, config: Config, stream: Stream):
         self._config, self._stream = config, stream
@@ -413,18 +413,18 @@ class _LateTracker:
         return self._tracker.add(frame)
 
     def expect(self, frame: AnyFrame, /) -> None:
-        """Begin with what can be done of a frame, as `Tracker.expect`."""
+        """Begin to prepare a frame, as `Tracker.expect`."""
         if self._tracker is not None:
             self._tracker.expect(frame)
 
     @property
     def imu_use(self) -> str:
-        """What was made of the IMU."""
+        """How the IMU was used, in words."""
         return self._tracker.imu_use if self._tracker else ""
 
 
 def _announced(images: Iterable[AnyFrame], expect: Callable[[AnyFrame], None]) -> Iterator[AnyFrame]:
-    """Yield images, each once `expect` was called with it: in the thread of the camera, before its turn comes."""
+    """Yield images, each after `expect` was called with it: in the camera's thread, ahead of its turn."""
     for image in images:
         expect(image)
         yield image
@@ -436,7 +436,7 @@ def _feed(camera: LiveCamera) -> _Feed:
 
 
 def _opened(where: str | Path) -> Stream:
-    """Open a camera; a recording none of whose images has a pose is one without poses, whatever its layout."""
+    """Open a camera; a recording without a pose for any image counts as one without poses, whatever its layout."""
     stream = open_camera(where)
     if not isinstance(stream, Paced) or not stream.posed or has_poses(stream.source):
         return stream

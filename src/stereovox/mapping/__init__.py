@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens to a frame that enters a map: checks, comparison, deadline, corrections."""
+"""What happens to a frame before it enters a map: checks, comparison, deadline, corrections."""

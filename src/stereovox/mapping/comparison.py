@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the evidence of a frame with the map before the map takes it in; what contradicts it is looked at closely."""
+"""Compare the evidence of a frame with the map before integration, and inspect contradictions closely."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from stereovox.sensors.noise import RangeNoise
 
 SURFACES = (State.OCCUPIED, State.TENTATIVE)
 FIRM = 0.4
-"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
+"""Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
-"""Most points of a frame in doubt that a glance keeps, that are looked at in the map, and that faults are tried on."""
+"""Most points of a frame in doubt that a glance keeps, that are looked up in the map, and that faults are tried on."""
 BLUR = 1.5
-"""Tolerance from glance to glance, as a multiple of that towards the map: both are noisy."""
+"""Tolerance between two glances, as a multiple of the tolerance to the map: both are noisy."""
 GAIN = 0.1
-"""Share of its points by which a frame must agree better under a fault, however little there is to explain."""
+"""Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
-"""Cells from a surface that is seen through to what is seen behind it; a floor seen at a flat angle is thick."""
+"""A surface is seen through by points more than this many cells behind it; a floor at a flat angle is thick."""
 REACH = 60.0
 """Metres along a ray within which the map's first surface is sought."""
 FARTHEST = 10
-"""Maximum ranges beyond which points do not count: a lidar may give any number, and the map ends somewhere."""
+"""Points farther than this many times `max_range` do not count: a lidar may return any range."""
 
 MIRRORED = {
     "mirrored": (-1, 1, 1),
@@ -53,25 +53,25 @@ TURNS_DEG = (-32, -24, -16, -8, 8, 16, 24, 32)
 STRETCHES = (0.67, 0.77, 0.87, 1.15, 1.3, 1.5)
 
 ALIGNED, BESIDE = 300, 3
-"""Most pixels that are registered with the map, and the distance in pixels of the neighbours for their normals."""
+"""Most pixels that are registered to the map, and the distance in pixels of the neighbours for their normals."""
 AROUND, FLAT = 16, 0.1
-"""Points of a cloud that give one its normal, and how flat they must lie: their spreads across and along."""
+"""Points of a cloud that give one its normal, and how flat they must be: largest ratio of spread across to along."""
 DENSE = 4000
-"""Most points of a cloud among which these are sought."""
+"""Most points of a cloud in which these neighbours are searched."""
 STEPS, EVERY = 20, 3
-"""Iterations of the registration, and of how many frames in doubt one is registered."""
+"""Iterations of the registration; of the frames in doubt, one in EVERY is registered."""
 REACH_M, REACH_CELLS = 0.6, 2.0
 """Search radius of a point for its surface in the first iteration (metres) and in the last (cells)."""
 MIN_POINTS = 30
-"""Points that must find a surface."""
+"""Least number of points that must find a surface."""
 MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
-"""How far a knocked camera may stand from its pose."""
+"""How far a knocked camera may be from its pose."""
 DAMPING = 1e-3
 """Damping of the least squares, for motions that no surface constrains."""
 
 
 def _faults() -> dict[str, NDArray[np.float64]]:
-    """Return what each fault makes of points in the sensor's frame: a matrix (3, 3)."""
+    """Return by name of each fault the matrix (3, 3) that undoes it, for points in the sensor's frame."""
     turns = [(f"turned by {deg} deg", np.radians(deg) * axis) for axis in np.eye(3) for deg in TURNS_DEG]
     return {
         **{name: np.diag(signs).astype(float) for name, signs in MIRRORED.items()},
@@ -98,7 +98,7 @@ class Comparison:
     ) -> GateResult:
         """Return what the gate needs to accept the frame.
 
-        evidence: what was made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
+        evidence: the evidence of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
         `Gate.check_agreement`.
         """
         if not self._compares:
@@ -111,20 +111,20 @@ class Comparison:
             return self._gate.check_agreement(frame, passed, against, sight)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
-        """Look at the first image once, so that kernels compile then and not when a frame is in doubt."""
+        """Inspect the first image, so that kernels compile now and not when a frame is in doubt."""
         if not self._prepared:
             self._prepared = True
             self._sight(image, None, voxel_map)
             pose_on_surfaces(voxel_map, image)
 
     def _sight(self, image: AnyImage, doubt: DisagreementSpell | None, voxel_map: VoxelMap) -> Sight:
-        """Return how a frame in doubt lies in the map; the work does not depend on the size of the image."""
+        """Return how a frame in doubt fits the map; the work does not depend on the size of the image."""
         seen, sigma = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), self._noise[image.camera].sigma
         return sight(voxel_map, image.T_world_sensor, seen, sigma, doubt, partial(_fault, voxel_map, image))
 
 
 class Surfaces(Protocol):
-    """A map that points are looked up in, as `VoxelMap` has it; what is no surface is FREE or UNKNOWN."""
+    """A map to look points up in, such as a `VoxelMap`; whatever is no surface is FREE or UNKNOWN."""
 
     @property
     def voxel_size(self) -> float:
@@ -136,7 +136,7 @@ class Surfaces(Protocol):
         ...
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits:
-        """Return where rays (N, 3) stop."""
+        """Return the first hit of each ray (N, 3)."""
         ...
 
 
@@ -148,11 +148,11 @@ def sight(
     doubt: DisagreementSpell | None,
     fault: Callable[[NDArray[np.float64], NDArray[np.float64], Placed, bool], str],
 ) -> Sight:
-    """Return how a frame in doubt lies in a map.
+    """Return how a frame in doubt fits a map.
 
     seen: (N, 3) points in the sensor's frame, at pose T. sigma: their noise by their distance, in metres. fault:
-    returns the name of what is wrong, by some of the points, their tolerances, how they lie, and whether there is time
-    to seek another pose.
+    returns the name of the fault from some of the points, their tolerances, their places in the map, and whether to
+    search for another pose.
     """
     points = thinned(seen, POINTS)
     tolerance = np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
@@ -168,11 +168,11 @@ def sight(
 
 
 class Placed(NamedTuple):
-    """Where points (N,) lie in the map.
+    """Where points (N,) are in the map.
 
-    agrees: on a surface. against: in what is known to be free, or behind an occupied cell and on no surface. behind:
-    on a surface, seen through an occupied cell before it. lengths: how often the ray to a point fits between the
-    sensor and the map's first surface along it, inf if missing.
+    agrees: on a surface. against: in known free space, or behind an occupied cell and on no surface. behind: on a
+    surface, but seen through an occupied cell. lengths: distance to the map's first surface along the ray, as a
+    multiple of the distance to the point; inf if there is no surface.
     """
 
     agrees: NDArray[np.bool_]
@@ -182,10 +182,10 @@ class Placed(NamedTuple):
 
 
 def _placed(voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
-    """Return where points (N, 3) in the sensor's frame lie in the map."""
+    """Return where points (N, 3) in the sensor's frame are in the map."""
     if not len(points):
-        none = np.zeros(0, bool)
-        return Placed(none, none, none, np.zeros(0))
+        empty = np.zeros(0, bool)
+        return Placed(empty, empty, empty, np.zeros(0))
     rays = points @ T[:3, :3].T
     away = np.linalg.norm(points, axis=1)
     agrees = _on_surface(voxel_map, T, points, tolerance)
@@ -201,7 +201,7 @@ def _placed(voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tole
 def _on_surface(
     voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which points (..., 3) in the sensor's frame lie on a surface, give or take (...) metres along the ray."""
+    """Return which points (..., 3) in the sensor's frame are on a surface, give or take (...) metres along the ray."""
     step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
     tries = np.stack([points * (1 - step), points, points * (1 + step)])
     placed = tries.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
@@ -216,7 +216,7 @@ def _fault(
     placed: Placed,
     align: bool,
 ) -> str:
-    """Return as `explained`; another pose is sought only if `align`, for it takes longest."""
+    """Return as `explained`; searches for another pose only if `align`, for that takes longest."""
     pose = partial(pose_on_surfaces, voxel_map, image) if align else None
     return explained(voxel_map, image.T_world_sensor, points, tolerance, placed.lengths, FAULTS, pose)
 
@@ -230,10 +230,10 @@ def explained(
     faults: Mapping[str, NDArray[np.float64]],
     pose: Callable[[], Transform | None] | None,
 ) -> str:
-    """Return the fault under which points (N, 3) of a sensor at T would lie on the map's surfaces, "" if missing.
+    """Return the fault under which points (N, 3) of a sensor at T would be on the map's surfaces, "" if none fits.
 
-    Tried are `faults`, depths too large or too small by a factor or by some metres (lengths: as in `Placed`), and a
-    sensor that stands elsewhere, at `pose`.
+    It tries `faults`, depths too large or too small by a factor or by some metres (lengths: as in `Placed`), and
+    another pose of the sensor, `pose`.
     """
     points, tolerance, lengths = (thinned(values, TRIED) for values in (points, tolerance, lengths))
     found = np.isfinite(lengths) & (lengths > 0)
@@ -247,7 +247,7 @@ def explained(
         times * points,
         points * (1 + metres / away)[:, None],
     ]
-    names = [*faults, f"its depths x {1 / times:.2g}", f"its depths {-metres:+.2g} m"]
+    names = [*faults, f"seen with depths x {1 / times:.2g}", f"seen with depths {-metres:+.2g} m"]
     shares = _on_surface(surfaces, T, np.stack(tried), np.broadcast_to(tolerance, (len(tried), len(points)))).mean(1)
     as_it_is = float(_on_surface(surfaces, T, points, tolerance).mean())
     enough = as_it_is + max(EXPLAINED * (1 - as_it_is), GAIN)
@@ -263,10 +263,10 @@ def explained(
 def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     """Return a T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
 
-    None if there is no such pose, or the image already lies there within a cell.
+    None if there is no such pose, or if the image is already there to within a cell.
 
-    Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the search
-    radius shrinks from iteration to iteration.
+    Iterative closest points, from points with normals to the centres of cells (Chen and Medioni 1992); the search
+    radius shrinks with each iteration.
     """
     points, normals = _surfaces(image, FARTHEST * voxel_map.config.max_range)
     T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
@@ -284,7 +284,7 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
 
 
 def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
-    """Return some of the image's points (N, 3) up to `reach` metres from the sensor, in its frame, about `most`."""
+    """Return about `most` of the image's points (N, 3) up to `reach` metres from the sensor, in its frame."""
     if isinstance(image, CheckedCloud):
         points = image.ends[image.hits]
         return thinned(points[_near(points, reach)], most)
@@ -295,19 +295,19 @@ def _sampled(image: AnyImage, most: int, reach: float) -> NDArray[np.float64]:
 
 
 def _near(points: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Return which points (..., 3) are finite, lie up to `reach` metres from the sensor, and not in it."""
+    """Return which points (..., 3) are finite, within `reach` metres of the sensor, and not at its origin."""
     with np.errstate(over="ignore"):
         away = np.linalg.norm(points, axis=-1)
     return (away > 0) & (away <= reach)
 
 
 def thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
-    """Return every n-th of values (N, ...), at most `most` of them."""
+    """Return every n-th of the values (N, ...), at most `most` in all."""
     return values[:: max(1, -(-len(values) // most))]
 
 
 def _surfaces(image: AnyImage, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return some points (N, 3) up to `reach` metres from the sensor, and their normals (N, 3), in its frame."""
+    """Return some points (N, 3) within `reach` metres of the sensor, and their normals (N, 3), in its frame."""
     if isinstance(image, CheckedCloud):
         points = image.ends[image.hits]
         return _surfaces_of_cloud(points[_near(points, reach)])
@@ -325,7 +325,7 @@ def _surfaces(image: AnyImage, reach: float) -> tuple[NDArray[np.float64], NDArr
 
 
 def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return some of these points and their normals, by the plane through the points around each."""
+    """Return some of these points and their normals, from planes fitted to the points around each."""
     from scipy.spatial import KDTree
 
     if len(points) < AROUND:
@@ -340,14 +340,14 @@ def _surfaces_of_cloud(points: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
 
 def _points(image: DepthImage, v: NDArray[np.integer], u: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return the points (..., 3) of pixels, NaN if they have no depth."""
+    """Return the points (..., 3) of pixels, NaN for those without depth."""
     columns, rows = (rays.astype(float) for rays in image.camera.rays())
     depth = np.where(np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], np.nan)
     return np.stack([columns[u], rows[v, 0], rows[v, 1]], axis=-1) * depth[..., None]
 
 
 def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDArray[np.float64]) -> Transform:
-    """Return the small rigid motion (4, 4) that brings points (N, 3), along their normals, nearest to others."""
+    """Return the small rigid motion (4, 4) that minimises the distances of points (N, 3) to others along normals."""
     middle = points.mean(axis=0)
     arms = points - middle
     jacobian = np.hstack([np.cross(arms, normals), normals])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deadline scheduler: choose the quality level of each frame so that frames take no longer than `deadline_ms`.
 
-Three levels, from thorough to quick: `full`; `near`, the same evidence on what is near and none on the rest; `coarse`,
-`near` from larger pixels.
+There are three levels, from thorough to quick: `full`; `near`, the same evidence, but only near the sensor; `coarse`,
+like `near` but from larger pixels.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sensors.noise import RangeNoise
 
 PATIENCE, MAX_PATIENCE = 8, 128
-"""Frames in time before the next better level is tried, at first and at most; one frame in 128 is less than 1 %."""
+"""Frames in time before the next better level is tried: at first, and at most; one frame in 128 is less than 1 %."""
 FACE = sqrt(2)
 """Largest ratio of a wide camera's depth to the depth of the pinhole images it is cut into."""
 
@@ -57,7 +57,7 @@ class Deadline:
         return self._levels[self._scheduler.level]
 
     def expect(self, frame: AnyFrame) -> None:
-        """Begin to prepare the next frame, if its level is known by now."""
+        """Begin to prepare the next frame if its level is already known."""
         if self._scheduler is None:
             self._levels[0].prepare.begin(frame)
 
@@ -67,9 +67,9 @@ class Deadline:
             self._scheduler.record(milliseconds)
 
     def warm_up(self, frame: AnyFrame, camera: VirtualCamera | Lidar) -> None:
-        """Run each camera's first frame through all other levels: no kernel then compiles when time is short."""
+        """Run each camera's first frame through all other levels, so that no kernel compiles when time is short."""
         if self._scheduler is None or camera in self._warm or len(self._warm) >= MAX_CAMERAS:
-            return  # a source with another camera in each frame would warm up for ever
+            return  # a source with a new camera in each frame would warm up for ever
         self._warm.add(camera)
         for level in self._levels[1:]:
             with suppress(FrameRefused):
@@ -77,7 +77,7 @@ class Deadline:
 
 
 class DepthStage(Protocol):
-    """What turns frames into depth images; see `DepthPipeline`."""
+    """Turns frames into depth images; see `DepthPipeline`."""
 
     def matched(self, frame: AnyFrame) -> Frame:
         """Return a stereo frame with its depth, any other frame unchanged."""
@@ -89,9 +89,9 @@ class DepthStage(Protocol):
 
 
 class Prepared(NamedTuple):
-    """A frame ready for the integrator, and the milliseconds that took."""
+    """A frame ready for the integrator, and the milliseconds spent on it."""
 
-    frame: Frame | Cloud  # with its depth, if that had to be matched
+    frame: Frame | Cloud  # with the matched depth, for stereo frames
     image: AnyImage
     match_ms: float
     depth_ms: float
@@ -116,7 +116,7 @@ class Quality:
 def prepared(depth: DepthStage, config: Config, frame: AnyFrame) -> Prepared:
     """Return the depth image of a frame, or the checked cloud. Raises FrameRefused as `depth` or `checked_cloud`."""
     started = perf_counter()
-    if isinstance(frame, Cloud):  # at every level whole: its rays end where the level's integrator stops
+    if isinstance(frame, Cloud):  # whole at every level: the level's integrator cuts its rays
         return Prepared(frame, checked_cloud(frame, config), 0.0, 1e3 * (perf_counter() - started))
     depth_frame = depth.matched(frame)
     matched = started if depth_frame is frame else perf_counter()
@@ -125,7 +125,7 @@ def prepared(depth: DepthStage, config: Config, frame: AnyFrame) -> Prepared:
 
 
 def full_quality(config: Config) -> Quality:
-    """Return the level that leaves nothing out."""
+    """Return the level that omits nothing."""
     return Quality(FULL, DepthPipeline(config), config)
 
 
@@ -148,7 +148,7 @@ def quality_levels(config: Config) -> list[Quality]:
 
 
 class Levels:
-    """All quality levels by name, made when they are first asked for; for frames that were mapped before."""
+    """All quality levels by name, built on first use; for frames that were mapped before."""
 
     def __init__(self, config: Config):
         self._config = config
@@ -163,9 +163,9 @@ class Levels:
 
 
 class NearDepth:
-    """Depth images up to `near` metres, `stride` by `stride` pixels merged into one; wide cameras keep all pixels.
+    """Depth images up to `near` metres, with `stride` by `stride` pixels merged into one; wide cameras keep all pixels.
 
-    A pixel beyond is TOO_FAR only if its noise cannot have put it there; otherwise it has no value.
+    A pixel beyond `near` is TOO_FAR only if noise alone cannot have put it there; otherwise it has no value.
     """
 
     def __init__(self, config: Config, near: float, stride: int):
@@ -193,15 +193,15 @@ def _far_from(config: Config, near: float, camera: object) -> float:
 class Scheduler:
     """Chooses a level, 0 the most thorough, from the milliseconds that frames took.
 
-    - A frame over the deadline: one level down, at once.
-    - As many frames in time, in a row, as the patience with the next better level: one level up. If that level is too
-      slow before as many frames have passed on it, it was tried too early: down again, and the patience with it
-      doubles, up to `MAX_PATIENCE`. If it lasts, the patience with it is `PATIENCE` again.
+    - A frame over the deadline moves it one level down, at once.
+    - Enough frames in time, in a row, move it one level up; each level's patience says how many. If the better level is
+      too slow within as many frames, it was tried too early: it moves down again, and the patience with that level
+      doubles, up to `MAX_PATIENCE`. If the better level lasts, its patience is reset to `PATIENCE`.
     - On the last level, time over the deadline is a debt; a frame is skipped when the debt reaches one deadline, but
       never two in a row, and the debt is at most two deadlines.
 
-    So a level that is in time is kept, one that is too slow is tried in one of 128 frames, and once the load is gone
-    the first level returns after at most 128 frames for each step.
+    So it keeps a level that is in time, tries one that is too slow in one of 128 frames, and once the load is gone
+    returns to the first level after at most 128 frames for each step.
     The first frame on each level does not count: it may compile kernels and allocate memory.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that contradict the map: is something wrong with them, or has the world changed?"""
+"""Frames that contradict the map: are they faulty, or has the world changed?"""
 
 from __future__ import annotations
 
@@ -16,51 +16,51 @@ DISAGREES, CONTRADICTS, CAMERA_MOVED = "disagrees_with_map", "contradicts_map", 
 USUAL_AT_FIRST, USUAL_GAIN = RunningMean(0.25, 0.06), 0.2
 """Disagreement assumed of a new sensor, and the weight of each frame in the exponential mean."""
 SPREADS = 4
-"""Spreads above the mean that are still usual."""
+"""How many spreads above the mean are still usual."""
 MAX_LIMIT = 0.8
-"""Disagreement that is too much, whatever is usual."""
+"""Disagreement that is always too much, whatever is usual."""
 AGAIN = 0.6
-"""Share of the tolerance above the usual that a frame may use to end a doubt: it must clearly agree."""
+"""Share of the tolerance above the usual that a frame may use if it is to end a doubt: it must clearly agree."""
 SOON_S, LATE_S = 0.2, 1.0
-"""A frame that comes later than SOON_S after the one before may disagree more: up to twice as much LATE_S later. It
-sees much that is new, and the world had time to change."""
+"""More than SOON_S after the previous frame, a frame may disagree more: twice as much from LATE_S later on. It sees
+much that is new, and the world had time to change."""
 FITS = 1 / 6
 """Share of doubted frames that must agree from another pose for the verdict MOVED; only some are registered."""
 UNTIMED_HZ = 30
-"""Frame rate assumed where stamps stand still."""
+"""Frame rate assumed if stamps do not advance."""
 ANCHORED = 0.5
-"""Share of what a frame sees of the known that must agree with the map: a change of the world is local."""
+"""Share of a frame's points on known cells that must agree with the map: a change of the world is local."""
 EXPLAINED = 0.4
-"""Share of what does not agree that a fault must explain to be the cause."""
+"""Share of the disagreeing points that a fault must explain to count as the cause."""
 MOSTLY_KNOWN, AGREES = 0.5, 0.95
-"""Shares of a frame's points that must be known, and of these that must agree, for a doubt that has lasted to end."""
+"""Share of a frame's points that must be known, and share of these that must agree, to end a doubt that has lasted."""
 FEW = 20
-"""Points that are too few to judge by."""
-TELLING = 0.2
-"""Share of the contradicting points that must tell a world from a fault, or else the camera has hardly moved."""
+"""Fewer points than this are too few to judge by."""
+DECISIVE = 0.2
+"""Share of the contradicting points that must separate a changed world from a fault; fewer: the camera hardly moved."""
 WORLDLY = 0.6
 """Share of these that must have stayed at their place in the world."""
 LOOKS = 3
-"""Looks in a row, each from another pose, at which a changed world must have stayed where it is."""
-PARTLY = "less than half of what it sees of the known is where it was: another place, or a fault"
+"""Frames in a row, each from another pose, in which a changed world must have stayed in place."""
+PARTLY = "less than half of the known space that it sees is as mapped: it is elsewhere, or faulty"
 CURES = {
-    "moved": "it would agree from elsewhere; calibrate where the sensor is, or reset the tracker",
+    "moved": "it would agree from another pose; calibrate the sensor's mount, or reset the tracker",
     "unanchored": f"{PARTLY}; check the sensor, or start a new map",
-    "still": "move the sensor: at rest a fault cannot be told from a world that has changed",
-    "fixed": "what contradicts the map moves with the sensor; clean it, or restart it",
-    "restless": "what contradicts the map is nowhere twice; check the sensor, or wait",
-    "": "it is looked at from more places",
+    "still": "move the sensor: at rest, a fault looks the same as a changed world",
+    "fixed": "the contradiction moves with the sensor; clean the sensor, or restart it",
+    "restless": "the contradiction is never at the same place twice; check the sensor, or wait",
+    "": "views from more places will decide",
 }
-"""What keeps a doubt open, and what helps."""
+"""Cause and cure of each outcome that keeps a doubt open."""
 
 
 class Sight(NamedTuple):
-    """How a frame in doubt lies in the map, point by point.
+    """How a frame in doubt fits the map, point by point.
 
-    anchored: share of its points on what is known that agree with the map; None if less than MOSTLY_KNOWN of all
-    are. fault: the fault under which it would agree, "" if missing. against: how many points contradict the
-    map. behind: how many of the points are known surfaces that are seen through what is known as occupied. votes: what
-    the glance before says of both. glance: what it sees itself.
+    anchored: share of its points on known cells that agree with the map; None if less than MOSTLY_KNOWN of all points
+    are known. fault: the fault under which it would agree, "" if none fits. against: how many points contradict the
+    map. behind: how many points are on known surfaces, but seen through occupied cells. votes: where the previous
+    glance saw the contradicting points. glance: what the frame sees.
     """
 
     anchored: float | None
@@ -72,38 +72,38 @@ class Sight(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether it ends a doubt that has lasted: it sees much of the known, and nearly all of that is there."""
+        """Whether it ends a doubt that has lasted: it sees much known space, and nearly all of it agrees."""
         return (self.anchored or 0.0) >= AGREES and not self.fault
 
     @property
-    def told(self) -> int:
-        """How many points tell a changed world from a fault."""
+    def decided(self) -> int:
+        """How many points separate a changed world from a fault."""
         return self.votes.world + self.votes.sensor + self.votes.neither
 
     @property
-    def telling(self) -> bool:
-        """Whether these are enough; they are few where the sensor has hardly moved."""
-        return self.told >= max(FEW, TELLING * self.against)
+    def decisive(self) -> bool:
+        """Whether these are enough; they are few if the sensor has hardly moved."""
+        return self.decided >= max(FEW, DECISIVE * self.against)
 
     @property
     def outcome(self) -> str:
-        """The name of the fault, or a key of CURES: what is wrong with it; "" if it shows a changed world."""
+        """The name of its fault, or a key of CURES; "" if it shows a changed world."""
         if self.fault:
             return self.fault
         if self.anchored is None or self.anchored < ANCHORED:
             return "unanchored"
         if self.behind >= max(FEW, WORLDLY * (self.behind + self.against)):
             return ""
-        if not self.telling:
+        if not self.decisive:
             return "still"
-        if self.votes.world >= WORLDLY * self.told:
+        if self.votes.world >= WORLDLY * self.decided:
             return ""
         return "fixed" if self.votes.sensor > self.votes.neither else "restless"
 
     def kept(self, before: Glance | None) -> Glance:
-        """Return the glance to compare the next frame with: a new one once there was enough to see from elsewhere."""
-        in_view = sum(self.votes) >= max(FEW, TELLING * self.against)
-        return before if before is not None and in_view and not self.telling else self.glance
+        """Return the glance to compare the next frame with: a new one once both differ enough or hardly overlap."""
+        in_view = sum(self.votes) >= max(FEW, DECISIVE * self.against)
+        return before if before is not None and in_view and not self.decisive else self.glance
 
 
 class Agreement(NamedTuple):
@@ -119,14 +119,14 @@ class Agreement(NamedTuple):
 
 
 class DisagreementMonitor:
-    """Compares each frame's disagreement with the map with that of its sensor's recent frames, kept in `history`.
+    """Judges each frame's disagreement with the map by that of its sensor's recent frames, kept in `history`.
 
-    A frame that disagrees more is refused, and so are the frames after it until one agrees again. The world has changed
-    once, after `trust.changed_s` at least, LOOKS frames in a row saw from different poses what contradicts the map at
-    one place of the world, while no fault explained it and half of the known was still there (`Sight.outcome`). From
-    then on frames are accepted, as long as that holds, until they agree again. Frames that see nothing known while
-    others are in doubt are refused, for the next ones would agree with those. Other frames that see nothing known
-    cannot be judged, and are accepted.
+    A frame that disagrees more is refused, and so are the next frames until one agrees again. The world counts as
+    changed if, after `trust.changed_s` at least, LOOKS frames in a row saw the contradiction from different poses at
+    one place of the world, while no fault explained it and half of the known points still agreed (`Sight.outcome`).
+    From then on frames are accepted, as long as that holds, until they agree again. While a sensor is in doubt, its
+    frames that see nothing known are refused, for the next ones would agree with them. Otherwise frames that see
+    nothing known cannot be judged, and are accepted.
     """
 
     def __init__(self, config: Config, history: History):
@@ -135,7 +135,7 @@ class DisagreementMonitor:
         self._changed_ns = round(1e9 * config.trust.changed_s)
 
     def limit(self, sensor: str, stamp_ns: int, share: float = 1.0) -> float:
-        """Return how far a frame may disagree with the map, 0 to 1; `share`: of the tolerance above the usual."""
+        """Return how far a frame may disagree with the map, 0 to 1; `share`: usable part of the tolerance."""
         mean, spread = self._history.usual.get(sensor, USUAL_AT_FIRST)
         late_s = 1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S
         share *= 1 + min(max(late_s / LATE_S, 0.0), 1.0)
@@ -154,7 +154,7 @@ class DisagreementMonitor:
         """Return what `accept` needs once the map has changed.
 
         against: share of the frame's evidence that contradicts the map, None if too little is known. sight: how it
-        lies in the map, where it is `in_doubt`. Raises FrameRefused: `disagrees_with_map`, `camera_moved`,
+        fits the map, if it is `in_doubt`. Raises FrameRefused: `disagrees_with_map`, `camera_moved`,
         `contradicts_map`.
         """
         before = self._history.doubts.get(sensor)
@@ -168,12 +168,12 @@ class DisagreementMonitor:
         if doubt.verdict == CHANGED:
             waited = before is not None and before.verdict == CHANGED
             return Agreement(against, doubt, "" if waited or before is None else self._reason(before))
-        if before is not None or not sight.agrees:  # or else it alone is in doubt, and not those after it
+        if before is not None or not sight.agrees:  # otherwise only this frame is in doubt, not the next ones
             self._remember(sensor, doubt)
         raise self._refusal(frame, against, limit, doubt, sight)
 
     def accept(self, sensor: str, agreement: Agreement) -> None:
-        """Remember a frame that the map took in."""
+        """Remember a frame that was integrated."""
         if agreement.doubt is not None:
             self._remember(sensor, agreement.doubt)
         elif agreement.against is not None:
@@ -182,7 +182,7 @@ class DisagreementMonitor:
             self._history.usual[sensor] = usual.updated(agreement.against, USUAL_GAIN)
 
     def _last_ns(self, sensor: str, now_ns: int) -> int:
-        """Return the stamp of the frame before, accepted or in doubt; `now_ns` if there is none."""
+        """Return the stamp of the previous frame, accepted or in doubt; `now_ns` if there is none."""
         stamps_ns = [self._history.doubts[sensor].last_ns] if sensor in self._history.doubts else []
         stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
         return max(stamps_ns, default=now_ns)
@@ -219,9 +219,9 @@ class DisagreementMonitor:
     def _refusal(
         self, frame: AnyFrame | Scan, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
     ) -> FrameRefused:
-        detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
+        detail = f"it disagrees with the map in {against or 0:.0%} of its evidence (limit {limit:.0%})"
         if against is None:
-            detail = "nothing that it sees is known, and frames just before it disagree with the map"
+            detail = "it sees nothing known, and the frames just before it disagree with the map"
         outcome = "moved" if doubt.verdict == MOVED else sight.outcome
         cure = CURES.get(outcome, f"it would agree if it were {outcome}; check driver, units and calibration")
         return FrameRefused(self._reason(doubt), f"{name_of(frame)}: {detail}; {cure}")

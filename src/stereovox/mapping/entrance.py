@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that is checked before a measurement may change a map: one row a check, one cell a kind of input.
+"""All checks before a measurement may change a map: one row per check, one cell per kind of input.
 
-A cell is the function that refuses, or the reason why there is nothing to check. Whatever brings measurements (arrays,
-recordings, cameras that run, ROS, fleets) hands them to `Mapper.add` or `GridMapper.add`, so the checks are the same.
-tests/mapping/test_entrance.py offers a bad input for each cell, and takes each function away to see that it is the one.
+A cell is the function that refuses, or the reason why there is nothing to check. All sources of measurements (arrays,
+recordings, live cameras, ROS, fleets) hand them to `Mapper.add` or `GridMapper.add`, so the checks are the same.
+tests/mapping/test_entrance.py offers a bad input for each cell, and disables each function to prove that it refuses.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN
 """Kinds of input: the first three enter a `Mapper`, the others a `GridMapper`."""
 Refuses = Callable[..., Any]
 Cell = Refuses | tuple[Refuses, ...] | str
-"""The function that refuses a bad input, or several, the later ones in case of the first; or why nothing is checked."""
+"""The function that refuses a bad input, or several (the later ones back up the first); or why nothing is checked."""
 
 
 class Check(NamedTuple):
     """One check of all kinds of input.
 
     Attributes:
-        reason: The word that refusals are counted by.
+        reason: The code under which refusals are counted.
         when: When an input is refused.
         cells: By kind of input.
-        setting: The settings that change it, "" if there are none.
+        setting: The settings that change it, "" for none.
     """
 
     reason: str
@@ -59,37 +59,37 @@ def _cells(one: Cell, *others: Cell) -> dict[str, Cell]:
 
 METRES = "its numbers are metres by definition; see `bad_units`"
 FROM_PAIR = "its depth is made here, in metres"
-SPACE = "evidence in space may come from any attitude"
+SPACE = "3-D evidence may have any attitude"
 OWN_POSE = "its pose is the sensor's own"
-LIT = "it is no picture: where light is wrong, values are missing"
+LIT = "it is no picture: bad light leaves values missing"
 BOUNDED = "the grid's work is bounded by `max_range`, which may span 4096 cells"
 NO_PIXELS = "it has no pixels"
 BY_CAMERA = "the camera bounds its size"
-ANY_MAPPER = "both mappers take it"
+ANY_MAPPER = "both mappers accept it"
 FAULT_OF_PAIR = validate.validate_fields, stereo.grey_rectified
 
 CHECKS = (
-    Check("bad_form", "a field is of another type", _cells(validate._check_fields)),
+    Check("bad_form", "a field has the wrong type", _cells(validate._check_fields)),
     Check("bad_form", "it is no frame at all, an array is masked, or `pose_sigma` is not two deviations",
           _cells(validate.validate_fields)),
-    Check("bad_form", "the mapper does not take this kind",
+    Check("bad_form", "the mapper does not accept this kind",
           _cells(ANY_MAPPER, ANY_MAPPER, 
                  (DepthPipeline.matched, validate.validate_fields, validate._check_fields), validate.validate_fields,
                  ANY_MAPPER, ANY_MAPPER)),
     Check("bad_stamp", "a stamp is no int64", _cells(validate._check_fields)),
-    Check("bad_sensor", "the name of the sensor is no text", _cells(validate._check_fields)),
-    Check("bad_sensor", "the name of the sensor is not printable, or longer than 256 characters",
+    Check("bad_sensor", "the sensor's name is not text", _cells(validate._check_fields)),
+    Check("bad_sensor", "the sensor's name is not printable, or longer than 256 characters",
           _cells(Gate._identify)),
     Check("bad_sensor", "it is the 65th sensor", _cells(Gate._fitting)),
     Check("(its own)", "the source could not deliver it, and says why (`fault`)",
           _cells(validate.validate_fields, FAULT_OF_PAIR, *[validate.validate_fields] * 3, FAULT_OF_PAIR)),
-    Check("bad_dtype", "values are of another type",
+    Check("bad_dtype", "values have the wrong type",
           _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
                  stereo.grey)),
-    Check("bad_shape", "an array has another shape than its camera, or its points",
+    Check("bad_shape", "the shape of an array does not match its camera, or its points",
           _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
                  stereo.grey)),
-    Check("bad_scale", "whole numbers come without a `depth_scale`, or it is not positive: 1500 may be 1.5 m or 1.5 km",
+    Check("bad_scale", "integer depths have no positive `depth_scale`: 1500 may be 1.5 m or 1.5 km",
           _cells(_check_image, FROM_PAIR, METRES, METRES, _check_image, FROM_PAIR)),
     Check("bad_reason", "reasons of pixels are invalid",
           _cells(_check_image, FROM_PAIR, NO_PIXELS, NO_PIXELS, _check_image, FROM_PAIR)),
@@ -102,7 +102,7 @@ CHECKS = (
     Check("too_many_beams", "a scan has over 65,536 beams",
           _cells(BY_CAMERA, "see `too_many_points`", beams._beams_of)),
     Check("bad_scan", "angles or limits are invalid", _cells(BY_CAMERA, NO_PIXELS, validate.validate_scan)),
-    Check("bad_clear", "`clear` or `clear_from` has another length",
+    Check("bad_clear", "`clear` or `clear_from` has the wrong length",
           _cells("it has none", "see `bad_shape`", beams._beams_of)),
     Check("no_pose", "there is no pose", _cells(validate.rigid_pose)),
     Check("pose_not_finite", "the pose holds NaN or infinity", _cells(validate._check_place)),
@@ -119,15 +119,15 @@ CHECKS = (
           "its pose is more than 0.05 s away from the nearest measured one (`pose_off_ns`)", _cells(Gate._identify),
           "trust.max_pose_off_s"),
     Check("stamp_backwards", "it is earlier than the last trusted one", _cells(Gate._settled), "trust.ordered"),
-    Check("clock_reset", "it is earlier by more than 1 s, or more than an hour later", _cells(Gate._settled),
+    Check("clock_reset", "it is more than 1 s earlier, or more than an hour later", _cells(Gate._settled),
           "trust.clock_reset_s, trust.max_gap_s"),
     Check("pose_jump", "it would have moved at more than 40 m/s or 1500 degrees/s", _cells(Gate._settled),
           "trust.max_speed_mps, trust.max_turn_dps"),
-    Check("frozen_image", "it is identical to the one before, but the sensor has moved by over 1 cm or 0.5 degrees",
+    Check("frozen_image", "it is identical to the previous one, but the sensor has moved by over 1 cm or 0.5 degrees",
           _cells(Gate._look), "trust.frozen"),
-    Check("frozen_image", "it shows what the sensor saw from elsewhere, with new noise",
+    Check("frozen_image", "it repeats what the sensor saw from elsewhere, with new noise",
           _cells(Gate._glances, Gate._glances, "a scan may look the same from many places"), "trust.frozen"),
-    Check("bad_units", "half of its depths or ranges are far beyond, or far below, what the map's limits allow",
+    Check("bad_units", "half of its depths or ranges are far above or far below the map's limits",
           _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays)),
     Check("no_valid_depth", "not one pixel has a value, and none is too far",
           _cells(prepare, "see `no_valid_point`", "see `no_valid_range`")),
@@ -135,22 +135,22 @@ CHECKS = (
                                                              "see `no_valid_range`")),
     Check("no_valid_range", "not one beam has a range",
           _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan)),
-    Check("too_few_values", "less than 0.5 % of the pixels, points or beams say something",
+    Check("too_few_values", "less than 0.5 % of the pixels, points or beams have a value or are too far",
           _cells(quality._check_share, quality._check_number, quality._check_number), "trust.min_valid_share"),
-    Check("no_surfaces", "less than half of the values are like those next to them, as they are on surfaces",
+    Check("no_surfaces", "less than half of the values resemble their neighbours, as values on surfaces do",
           _cells(quality.check_depth, quality._check_alike, quality._check_alike), "trust.min_surface_share"),
-    Check("too_dark", "90 % of an image are black",
+    Check("too_dark", "90 % of an image is black",
           _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
-    Check("overexposed", "90 % of an image are saturated",
+    Check("overexposed", "90 % of an image is saturated",
           _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
     Check("tilted", "the lidar leans by more than 5 degrees, so its beams meet the floor",
           _cells(SPACE, SPACE, SPACE, validate.validate_upright_scan, "see `camera_tilted`", "see `camera_tilted`"),
           "grid.max_tilt_deg"),
-    Check("camera_tilted", "no row of the image looks level (method `rows`; `cloud` takes any)",
+    Check("camera_tilted", "no row of the image is level (method `rows`; `cloud` accepts any attitude)",
           _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.level_rows, scan.level_rows), "scan.off_level_deg"),
     Check("camera_vertical", "the camera looks straight up or down",
           _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.levelled, scan.levelled)),
-    Check("below_floor", "the camera, or much of what it sees, lies below the floor",
+    Check("below_floor", "the camera, or much of what it sees, is below the floor",
           _cells(SPACE, SPACE, SPACE, "a lidar measures at one height", scan.check_floor, scan.check_floor),
           "scan.floor"),
     Check("heights_not_seen", "the camera sees nothing of `scan.heights`",
@@ -158,38 +158,38 @@ CHECKS = (
           "scan.heights"),
     Check("disagrees_with_map", "more of it contradicts the map than is usual for its sensor",
           _cells(DisagreementMonitor.check), "trust.max_disagreement, trust.pose_error_m"),
-    Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and what they show is no changed world",
+    Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and do not show a changed world",
           _cells(DisagreementMonitor.check), "trust.changed_s"),
-    Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from elsewhere",
+    Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from another pose",
           _cells(DisagreementMonitor.check), "trust.moved_s"),
     Check("memory_full", "its cells do not fit into `max_memory`",
           _cells(CappedStorage.check_room, CappedStorage.check_room, CappedStorage.check_room, GridStorage.check_room,
                  GridStorage.check_room, GridStorage.check_room), "max_memory, when_full"),
     Check("no_time", "frames take longer than `deadline_ms` even at the quickest level",
-          _cells(*[Deadline.quality] * 3, *["a floor's grid has no deadline: a scan takes about a millisecond"] * 3),
+          _cells(*[Deadline.quality] * 3, *["a floor grid has no deadline: a scan takes about a millisecond"] * 3),
           "deadline_ms"),
     Check("no_clouds", "clouds are mapped on the processor only",
-          _cells("it is mapped there, too", Integration.evidence, "grids are made on the processor only"), "device"),
+          _cells("it is mapped there too", Integration.evidence, "grids are made on the processor only"), "device"),
 )  # fmt: skip
-"""All checks; those of the same reason by where they are made."""
+"""All checks; rows with the same reason differ in where they are made."""
 
 ELSEWHERE = {
     "missing_file": "no such image or cloud",
     "unreadable": "the file or message is damaged, truncated, or of another kind",
-    "bad_pose_file": "a pose that cannot be read",
-    "low_confidence": "camera pair, live: the tracker trusts its pose less than `min_confidence`",
+    "bad_pose_file": "a pose cannot be read",
+    "low_confidence": "camera pair, live: the tracker's confidence is below `min_confidence`",
     "not_localised": "the ROS 2 node does not know where the robot is in its map",
-    "clock_doubt": "live, ROS 2: it is not known how far the clocks of sensors and poses are apart",
-    "no_camera": "ROS 2: no camera info has come",
-    "tracking_lost": "tracking: it is not known where the camera is",
-    "no_photo": "tracking: no picture was taken along with a depth image",
-    "not_in_order": "SLAM and localisation: not later than the scan before",
+    "clock_doubt": "live, ROS 2: the offset between the clocks of sensors and poses is unknown",
+    "no_camera": "ROS 2: no camera info was received",
+    "tracking_lost": "tracking: the camera's pose is unknown",
+    "no_photo": "tracking: a depth image has no color image taken with it",
+    "not_in_order": "SLAM and localisation: not later than the previous scan",
 }
-"""Reasons that sources, trackers and localisation give; a frame with one as its `fault` is refused for it."""
+"""Reasons that sources, trackers and localisation give as the `fault` of a frame, which is then refused."""
 
 
 def table(checks: Sequence[Check] = CHECKS) -> list[str]:
-    """Return the table as lines of Markdown: for each check and kind its function, or why there is none."""
+    """Return the table as lines of Markdown: for each check and kind its function, or why it has none."""
     head = f"| refused as | when | {' | '.join(KINDS)} | setting |"
     lines = [head, "|" + "---|" * (len(KINDS) + 3)]
     for check in checks:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a scan with the grid before the grid takes it in: as `comparison` does for frames in space."""
+"""Compare a scan with the grid before integration, as `comparison` does for frames in space."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from stereovox.maps.query.queries import RayHits
 from stereovox.maps.record.history import DisagreementSpell
 
 ERROR_M = 0.05
-"""How far a hit may lie from the surface that it is on: noise of lidars and poses, half a wall that is drawn thick."""
+"""How far a hit may be from its surface: noise of lidars and poses, and half the thickness of walls as drawn."""
 LEVEL_M = 0.02
 """Difference in height up to which two sensors see the same obstacles."""
 MIRRORED = {"mirrored": (1, -1, 1), "back to front": (-1, 1, 1)}
 TURNED_DEG, MOUNTED_DEG = range(2, 31, 2), range(32, 181, 2)
-"""Turns of a sensor that has moved, and of one that is mounted otherwise than was said."""
+"""Turns of a sensor that has moved, and of one whose mount was given wrong."""
 SHIFTED_M, SHIFT_TURN_DEG = 0.6, np.arange(-15, 15.1, 1.5)
-"""How far a knocked sensor, or one whose poses come late, is sought along each axis, and by which turns."""
+"""Search range along each axis, and turns, for a sensor that was knocked or whose poses are late."""
 FITS = 0.9
-"""Share of the points that must then lie on surfaces, or else other faults are tried first."""
+"""Share of the points that must then be on surfaces; otherwise other faults are tried first."""
 FAR_CELLS = 400
-"""Cells from the sensor within which its hits are laid onto the grid for that."""
+"""Cells from the sensor within which hits count in that search."""
 
 
 def _faults() -> dict[str, NDArray[np.float64]]:
-    """Return what each fault makes of points in the sensor's frame: a matrix (3, 3)."""
+    """Return by name of each fault the matrix (3, 3) that undoes it, for points in the sensor's frame."""
     turns = {f"turned by {s * deg} deg about z": s * deg for deg in TURNED_DEG for s in (1, -1)}
     turns |= {f"turned by {s * deg} deg": s * deg for deg in MOUNTED_DEG for s in (1, -1)}
     return {
@@ -53,8 +53,8 @@ FAULTS = _faults()
 class FloorComparison:
     """Compares each scan with the grid, and lets the gate decide whether to accept it.
 
-    What one sensor sees over is an obstacle for another: nothing is compared once sensors at different heights have
-    mapped a grid, nor images with one that began as a picture (`from_picture`), whose sensor is not known.
+    An obstacle for one sensor may be too low for another: nothing is compared once sensors at different heights have
+    mapped a grid. Nor are images compared with a grid loaded from a picture (`from_picture`): its sensor is unknown.
     """
 
     def __init__(self, config: Config, gate: Gate, from_picture: bool):
@@ -65,9 +65,9 @@ class FloorComparison:
     def check(
         self, frame: AnyFrame | Scan, scan: Scan, evidence: GridEvidence, passed: GateResult, grid_map: GridMap
     ) -> GateResult:
-        """Return what the gate needs to accept the scan that was made of `frame`.
+        """Return what the gate needs to accept `scan`, which was made from `frame`.
 
-        evidence: what was made of it. passed: what `Gate.check` returned. Raises FrameRefused as
+        evidence: the evidence of the scan. passed: what `Gate.check` returned. Raises FrameRefused as
         `Gate.check_agreement`.
         """
         if not self._compares or (self._from_picture and not isinstance(frame, Scan)):
@@ -84,7 +84,7 @@ class FloorComparison:
             return self._gate.check_agreement(frame, passed, against, found)
 
     def _sight(self, scan: Scan, doubt: DisagreementSpell | None, grid_map: GridMap) -> Sight:
-        """Return how a scan in doubt lies in the grid."""
+        """Return how a scan in doubt fits the grid."""
         reach = min(self._reach, scan.range_max)
         hit = (scan.ranges >= scan.range_min) & (scan.ranges > 0) & (scan.ranges <= reach)
         angles, ranges = scan.angles[hit], scan.ranges[hit].astype(float)
@@ -105,7 +105,7 @@ def _fault(
     placed: Placed,
     align: bool,
 ) -> str:
-    """Return as `explained`: a pose from which nearly all would agree comes first, for wrong ranges look alike."""
+    """Return as `explained`, but first try a pose from which nearly all would agree: wrong ranges look like one."""
     there = plane.pose_on_surfaces(T, points) if align else None
     if there is not None and plane.share(there, points) >= max(FITS, plane.share(T, points) + GAIN):
         return "moved"
@@ -113,9 +113,9 @@ def _fault(
 
 
 class Plane:
-    """A grid as points in space are looked up in it: their heights do not count, and surfaces are `around` cells thick.
+    """A grid in which points in space are looked up: their heights are ignored, and surfaces widen by `around` cells.
 
-    It is `comparison.Surfaces`.
+    It implements `comparison.Surfaces`.
     """
 
     def __init__(self, grid_map: GridMap, around: int):
@@ -127,19 +127,19 @@ class Plane:
         return self._storage.seen_at(np.floor(self._cells(np.asarray(points))).astype(np.int64), self._around)
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_distance: float) -> RayHits:
-        """Return the distance along rays (N, 3) of any length to the first occupied cell; infinity if missing."""
-        starts, ways = np.asarray(origins, float), np.asarray(directions, float)
-        far = max_distance / np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
-        lines = np.column_stack([self._cells(starts), self._cells(starts + ways * far[:, None])])
-        return RayHits.none(len(ways))._replace(distance=self._storage.cast(lines) * max_distance)
+        """Return the distance along rays (N, 3) of any length to the first occupied cell; infinity if there is none."""
+        starts, rays = np.asarray(origins, float), np.asarray(directions, float)
+        far = max_distance / np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
+        lines = np.column_stack([self._cells(starts), self._cells(starts + rays * far[:, None])])
+        return RayHits.none(len(rays))._replace(distance=self._storage.cast(lines) * max_distance)
 
     def share(self, T: Transform, points: NDArray[np.float64]) -> float:
-        """Return the share of points (N, 3) in the sensor's frame that are near a surface from T."""
+        """Return the share of points (N, 3) in the sensor's frame that are near a surface if the sensor is at T."""
         found = self.state(points @ T[:3, :3].T + T[:3, 3])
         return float((found == State.OCCUPIED).mean()) if len(found) else 0.0
 
     def pose_on_surfaces(self, T: Transform, points: NDArray[np.float64]) -> Transform | None:
-        """Return the T_world_sensor near T from which most of some points (N, 3) lie on surfaces; None: it is T."""
+        """Return the T_world_sensor near T that puts the most of points (N, 3) on surfaces; None if that is T."""
         if not len(points):
             return None
         points = thinned(points, TRIED)
@@ -169,6 +169,6 @@ class Plane:
 
 
 def _thickened(picture: NDArray[np.bool_], rim: int) -> NDArray[np.bool_]:
-    """Return a picture, less `rim` on each side, of what is up to `rim` rows and columns from something."""
+    """Return a picture, less `rim` on each side, of all pixels within `rim` rows and columns of a set one."""
     rows = np.logical_or.reduce([picture[k : len(picture) - 2 * rim + k] for k in range(2 * rim + 1)])
     return np.logical_or.reduce([rows[:, k : rows.shape[1] - 2 * rim + k] for k in range(2 * rim + 1)])

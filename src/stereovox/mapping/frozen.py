@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find a frame that shows what its sensor saw from elsewhere: frozen, whatever noise each image has.
+"""Find a frame that repeats its sensor's view from another pose: it is frozen, whatever noise each image has.
 
-What is in the world stays there as the sensor moves; what is in a frozen image moves with the sensor. So a frame is
-compared with glances that the sensor had from other poses: points that are unmoved in the sensor, and in the world.
+Things in the world stay in place as the sensor moves; the contents of a frozen image move with the sensor. So a frame
+is compared with earlier glances from other poses: which of their points are unmoved in the sensor, and in the world?
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from stereovox.sensors.noise import RangeNoise
 SAMPLED = 4000
 """Most points of a frame that are compared."""
 FARTHEST = 10
-"""Maximum ranges beyond which points do not count: a lidar may report any distance."""
+"""Points farther than this many times `max_range` do not count: a lidar may report any distance."""
 BLUR = 1.5
 """Tolerance between two frames, as a multiple of the noise of one: both are noisy."""
 STEP, TURN = 0.1, np.radians(8)
 """A glance is kept once the sensor has moved by this share of the median distance in view, or turned by this angle."""
 NEAR, NEAR_TURN = 0.3, 0.4
-"""Up to this motion a glance is compared: from farther away, many points are unmoved by chance."""
+"""Glances are compared up to this motion: from farther away, many points are unmoved by chance."""
 FEW, TIMES = 20, 1.5
 """A frame is frozen if this many points are unmoved in the sensor alone, and this many times more than in the world."""
 
 
 class FrozenViews:
-    """Compares frames with glances that the same sensor had lately."""
+    """Compares frames with recent glances of the same sensor."""
 
     def __init__(self, config: Config):
         self._reach, self._least = FARTHEST * config.max_range, config.voxel_size
         self._noise = PerCamera(partial(RangeNoise.of, config.noise))
 
     def ranges(self, image: AnyImage) -> NDArray[np.float32]:
-        """Return the distance seen in each direction: (SIDE, SIDE) metres, 0: nothing."""
+        """Return the range in each direction, (SIDE, SIDE) metres, 0 for none."""
         if isinstance(image, CheckedCloud):
             points = image.ends[:: max(1, -(-len(image.ends) // SAMPLED))]
             points = points[image.hits[:: max(1, -(-len(image.ends) // SAMPLED))]]
@@ -59,9 +59,9 @@ class FrozenViews:
     def unmoved(
         self, glances: tuple[Glance, ...], camera: VirtualCamera | Lidar, T: Transform, ranges: NDArray[np.float32]
     ) -> tuple[int, int]:
-        """Return how many points of `glances` are where they were in the sensor alone, and in the world alone.
+        """Return how many points of `glances` are unmoved in the sensor alone, and in the world alone.
 
-        T: T_world_sensor (4, 4) of the frame. ranges: (SIDE, SIDE) metres that it saw.
+        T: T_world_sensor (4, 4) of the frame. ranges: its ranges, (SIDE, SIDE) metres.
         """
         in_sensor = in_world = 0
         for glance in glances:
@@ -78,7 +78,7 @@ class FrozenViews:
     def _placed(
         self, ranges: NDArray[np.float32], camera: VirtualCamera | Lidar, points: NDArray[np.floating]
     ) -> NDArray[np.uint8]:
-        """Return how points (N, 3) in the sensor's frame compare with what it sees, as `place`."""
+        """Return where points (N, 3) in the sensor's frame are among its ranges, as `place`."""
         distances = np.sqrt(np.einsum("ni,ni->n", points, points))
         tolerance = BLUR * np.maximum(self._least, self._noise[camera].sigma(distances))
         found = np.empty(len(points), np.uint8)
@@ -87,12 +87,12 @@ class FrozenViews:
 
 
 def is_frozen(in_sensor: int, in_world: int) -> bool:
-    """Return whether points that are unmoved show a frozen image."""
+    """Return whether these numbers of unmoved points show a frozen image."""
     return in_sensor >= FEW and in_sensor > TIMES * in_world
 
 
 def with_glance(glances: tuple[Glance, ...], T: Transform, ranges: NDArray[np.float32]) -> tuple[Glance, ...]:
-    """Return the glances to keep after a frame: it is added if it was taken elsewhere than the last one."""
+    """Return the glances to keep after a frame: its own is added if it was taken elsewhere than the last one."""
     if glances:
         metres, angle = apart(glances[-1].pose, tuple(T[:3].ravel().tolist()))
         if metres < STEP * glances[-1].typical_m and angle < TURN:

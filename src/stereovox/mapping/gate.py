@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last check before a frame may change the map: does it agree with the frames before it, and with the map?
+"""The last check before a frame may change the map: does it agree with earlier frames and with the map?
 
-`Gate` compares stamps, poses and images; `trust.disagreement` judges how far the evidence contradicts the map.
+`Gate` compares stamps, poses and images; `disagreement` judges how far the evidence contradicts the map.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from stereovox.maps.record.history import (
 )
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
-"""Pose noise: a step this small is no jump, however short the time."""
+"""Pose noise: a step this small is never a jump, however short the time."""
 BACKWARDS, RESET, JUMP = "stamp_backwards", "clock_reset", "pose_jump"
 STILL_M, STILL_RAD = 0.01, radians(0.5)
 """Apparent motion of a camera at rest with a jittery tracker."""
 DIGEST_ROWS = 16
 """Rows of an image that its checksum covers."""
 DIGEST_POINTS = 1024
-"""Points of a cloud that its checksum covers: many may have no value."""
+"""Points of a cloud that its checksum covers; many may have no value."""
 ROUGH, ROUGH_SHARE = 1e-3, 0.2
-"""Measured inverse depth bends by at least this share of itself, at this share of the pixels; walls without noise do
-not, and look the same from many places."""
+"""Measured inverse depth bends by more than this share of itself, at more than this share of the pixels; walls without
+noise do not, and look the same from many places."""
 
 
 class GateResult(NamedTuple):
     """A frame that passed the gate: its sensor, stamp and pose.
 
-    after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None for scans. agreement:
-    how it agrees with the map, None if that was not compared. glances: what is kept of its sensor's views.
+    after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None if `trust.frozen` is
+    off. agreement: how it agrees with the map, None if they were not compared. glances: those to keep for its sensor.
     """
 
     sensor: str
@@ -66,10 +66,10 @@ class GateResult(NamedTuple):
 class Gate:
     """Checks stamps and poses of each sensor against its last trusted frame, kept in `history` and saved with the map.
 
-    A frame that jumped, or whose clock was reset, is refused, and so are the frames after it that belong to it. Once
-    they have agreed with each other for `trust.settle_s` (by their stamps) they are accepted again, so that a tracker
-    that relocalised is not refused for ever. A frame counts with the refused ones where coming from them takes a lower
-    speed than from the trusted one. A frame that fits the trusted one ends the wait of the others.
+    A frame that jumped, or whose clock was reset, is refused, and so are the next frames that fit it. Once they have
+    agreed with each other for `trust.settle_s` (by their stamps) they are accepted again, so that a tracker that
+    relocalised is not refused for ever. A frame joins the refused ones if reaching it from them takes a lower speed
+    than from the trusted one. A frame that fits the trusted one ends the wait of the others.
     """
 
     def __init__(self, config: Config, history: History):
@@ -86,8 +86,8 @@ class Gate:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
-        `stamp_backwards`, `clock_reset`, `pose_jump`, `frozen_image`. Of a refused frame only its stamp and pose are
-        remembered, since it may agree with the next one.
+        `stamp_backwards`, `clock_reset`, `pose_jump`, `frozen_image`. Only the stamp and pose of a refused frame are
+        remembered, since the next one may agree with them.
         """
         sensor, stamp_ns = self._identify(frame)
         numbers = image.T_world_sensor.ravel().tolist()
@@ -105,18 +105,18 @@ class Gate:
         return self._monitor.in_doubt(passed.sensor, passed.seen.stamp_ns, against)
 
     def doubt(self, passed: GateResult) -> DisagreementSpell | None:
-        """Return the doubt that frames of its sensor are in, None if they agree."""
+        """Return the doubt about frames of its sensor, None if they agree."""
         return self._history.doubts.get(passed.sensor)
 
     def others_apart(self, passed: GateResult, metres: float) -> bool:
-        """Return whether trusted frames of another sensor were taken higher or lower by more than so many metres."""
+        """Return whether the last trusted frame of any other sensor was more than `metres` higher or lower."""
         trusted, height = self._history.trusted, passed.seen.pose[11]
         return any(abs(one.pose[11] - height) > metres for name, one in trusted.items() if name != passed.sensor)
 
     def check_agreement(
         self, frame: AnyFrame | Scan, passed: GateResult, against: float | None, sight: Sight | None
     ) -> GateResult:
-        """Return what `accept` needs of a frame that was compared with the map.
+        """Return what `accept` needs for a frame that was compared with the map.
 
         Arguments and errors: as `DisagreementMonitor.check`.
         """
@@ -124,7 +124,7 @@ class Gate:
         return passed._replace(agreement=agreement, after=passed.after or agreement.after)
 
     def accept(self, passed: GateResult) -> None:
-        """Remember a frame that the map took in."""
+        """Remember a frame that was integrated."""
         self._history.trusted[passed.sensor] = passed.seen
         self._history.waiting.pop(passed.sensor, None)
         if passed.look is not None:
@@ -137,20 +137,20 @@ class Gate:
             self._history.settled[passed.after] += 1
 
     def _identify(self, frame: AnyFrame | Scan) -> tuple[str, int]:
-        """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses that are too old."""
+        """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses far off in time."""
         off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
             limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
-            detail = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
+            detail = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses sooner"
             raise FrameRefused("pose_extrapolated", detail)
         if len(frame.sensor) > MAX_NAME_LENGTH or not frame.sensor.isprintable():
-            detail = f"sensor is not a printable name of at most {MAX_NAME_LENGTH} characters; rename it"
+            detail = f"the sensor has no printable name of at most {MAX_NAME_LENGTH} characters; rename it"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
         usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
         return frame.sensor or usual, int(frame.stamp_ns)
 
     def _look(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> ImageFingerprint | None:
-        """Return the frame's checksum. Raises FrameRefused for a repeated image although the sensor has moved."""
+        """Return the frame's checksum. Raises FrameRefused if the image repeats although the sensor has moved."""
         if not self._trust.frozen:
             return None
         look, before = ImageFingerprint(_digest(frame), now.pose), self._history.looks.get(sensor)
@@ -159,28 +159,28 @@ class Gate:
         metres, angle = apart(before.pose, now.pose)
         if (metres > STILL_M or angle > STILL_RAD) and _is_measured(frame):
             what, cure = ("image", "camera") if isinstance(frame, Frame | StereoFrame) else ("sweep", "lidar")
-            detail = f"the {what} is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
+            detail = f"the {what} repeats the last one, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
 
     def _glances(self, frame: AnyFrame | Scan, sensor: str, image: AnyImage) -> tuple[Glance, ...]:
-        """Return the glances to keep. Raises FrameRefused for a frame that shows what was seen from elsewhere."""
+        """Return the glances to keep. Raises FrameRefused for a frame that repeats a view from elsewhere."""
         glances, ranges, T = self._history.glances.get(sensor, ()), self._views.ranges(image), image.T_world_sensor
         in_sensor, in_world = self._views.unmoved(glances, image.camera, T, ranges)
         if is_frozen(in_sensor, in_world):
             detail = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
             raise FrameRefused(
                 "frozen_image",
-                f"{name_of(frame)}: it shows what was seen from elsewhere ({detail}); restart the sensor",
+                f"{name_of(frame)}: it repeats a view from elsewhere ({detail}); restart the sensor",
             )
         return with_glance(glances, T, ranges)
 
     def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
-        """Return a frame that fits the last trusted one, or that is accepted again."""
+        """Return a frame that fits the last trusted one or is accepted again; refuse any other."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
             if len(self._history.trusted) >= MAX_SENSORS:
-                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MAX_SENSORS} sensors; name fewer")
+                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MAX_SENSORS} sensors; use fewer names")
             return GateResult(sensor, now)
         why, haste = self._against(trusted, now)
         waiting = self._history.waiting.get(sensor)
@@ -189,12 +189,12 @@ class Gate:
         return self._settled(frame, GateResult(sensor, now), trusted, (why, haste), waiting)
 
     def _against(self, before: StampedPose, now: StampedPose) -> tuple[str, float]:
-        """Return why `now` cannot follow `before` ("": it can), and its speed as a share of what is allowed."""
+        """Return why `now` cannot follow `before` ("": it can), and its speed as a share of the limit."""
         ahead_ns = now.stamp_ns - before.stamp_ns
         if self._trust.ordered and (ahead_ns < 0 or ahead_ns > self._ahead_ns):
             return (BACKWARDS if -self._reset_ns <= ahead_ns < 0 else RESET), inf
         if ahead_ns <= 0:
-            return "", 0.0  # the same time, as far as is known: no speed
+            return "", 0.0  # the same time, or unordered stamps: no speed
         metres, angle = apart(before.pose, now.pose)
         allowed = 1e-9 * ahead_ns
         moved, turned = (metres - SLACK_M) / self._trust.max_speed_mps, (angle - SLACK_RAD) / self._turn
@@ -209,7 +209,7 @@ class Gate:
         found: tuple[str, float],
         waiting: Streak | None,
     ) -> GateResult:
-        """Return the frame where it may be accepted although it does not fit or others wait; otherwise refuse it."""
+        """Return the frame if it may be accepted although it does not fit or others wait; otherwise refuse it."""
         (why, haste), now = found, passed.seen
         follows, slower = False, False
         if waiting is not None:
@@ -232,10 +232,10 @@ class Gate:
     def _detail(self, why: str, before: StampedPose, now: StampedPose) -> str:
         seconds = (now.stamp_ns - before.stamp_ns) / 1e9
         if why == BACKWARDS:
-            return f"taken {-seconds:.6g} s before the last trusted one; put frames in order or set trust.ordered=false"
+            return f"it is {-seconds:.6g} s older than the last trusted one; sort the frames or set trust.ordered=false"
         until = f"accepted again once frames agree for {self._trust.settle_s:g} s"
         if why == RESET:
-            return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
+            return f"its stamp is {seconds:+.6g} s off the last trusted one, so its clock was reset; {until}"
         metres, angle = apart(before.pose, now.pose)
         return (
             f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
@@ -263,7 +263,8 @@ def _digest(frame: AnyFrame | Scan) -> int:
 def _is_measured(frame: AnyFrame | Scan) -> bool:
     """Return whether depths or ranges have noise: whether their inverse bends between neighbours.
 
-    That of a plane does not in an image, and between beams only by their angle. Other frames are taken for measured.
+    The inverse depth of a plane does not bend in an image, nor, corrected for the angle step, between beams. Stereo
+    frames and clouds always count as measured.
     """
     if isinstance(frame, StereoFrame | Cloud):
         return True

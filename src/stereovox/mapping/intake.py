@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every mapper does around its map: take frames one at a time, gate them, count refusals, monitor health."""
+"""What every mapper does around its map: accept frames one at a time, gate them, count refusals, monitor health."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Intake:
     A refused frame (FrameRefused) is counted in the map's history and changes nothing else.
 
     Attributes:
-        gate: Compares each frame with those before it; its memory is the map's history.
-        monitor: Records when each frame was taken and arrived, and what became of it.
+        gate: Compares each frame with earlier ones; its memory is the map's history.
+        monitor: Records when each frame was taken, when it arrived, and what became of it.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Intake:
         self._map, self._adding = target, MapLock()
 
     def offer(self, frame: AnyFrame | Scan) -> PendingFrame:
-        """Return a frame that arrives now; enter it with `with` while the map takes it in.
+        """Return a frame that arrives now; use it in a `with` block around the integration.
 
         Raises:
             StereovoxError: This thread holds the map's lock.
@@ -51,12 +51,12 @@ class Intake:
         return PendingFrame(self, frame, arrived_ns)
 
     def closed(self) -> AbstractContextManager[object]:
-        """Return what lets no frame in while it is entered."""
+        """Return a context that lets no frame in while it is entered."""
         return self._adding
 
 
 class Aged:
-    """What mappers say of their map's age, by their `_intake`."""
+    """The queries of a mapper about its map's age, answered by its `_intake`."""
 
     _intake: Intake
 
@@ -73,13 +73,13 @@ class Aged:
 
     @property
     def stamp_clock(self) -> StampsBy:
-        """By which clock frames are stamped, from which `health` knows how late they come; it may be set at any time.
+        """The clock of the frames' stamps, by which `health` knows how late they are; it may be set at any time.
 
-        A function: returns the present time by that clock in nanoseconds, None while it is not known. "live": stamps
-        advance with the time, by a clock of this machine, which is recognised, or by another, of which the least delay
-        that was seen is taken for none. "replay": stamps are those of a recording, played at any speed; ages count from
-        the newest stamp. None: a clock of this machine if it is recognised, else as "replay", until an
-        `ObstacleSender` makes it "live". Setting it raises ConfigError for anything else.
+        A function: returns the present time by that clock in nanoseconds, None while it is unknown. "live": stamps
+        advance in real time, by a clock of this machine, which is recognised, or by another clock, whose least delay
+        seen so far counts as zero. "replay": stamps are from a recording, played at any speed; ages count from the
+        newest stamp. None: a clock of this machine if one is recognised, else as "replay", until an `ObstacleSender`
+        makes it "live". Setting it raises ConfigError for anything else.
         """
         return self._intake.monitor.stamps.by
 
@@ -88,11 +88,11 @@ class Aged:
         self._intake.monitor.stamps.by = clock
 
     def heard(self, stamp_ns: int, source: str = "poses") -> None:
-        """Take note that something with a stamp came now, such as a pose: what was stamped earlier is at least as old.
+        """Record that a stamped message, such as a pose, arrived now: anything stamped earlier is at least as old.
 
         Args:
             stamp_ns: Its time in nanoseconds, by the clock of the frames' stamps.
-            source: Where it came from.
+            source: Its origin.
         """
         monitor = self._intake.monitor
         monitor.stamps.heard(f"{source} alone", int(stamp_ns), monitor.now())
@@ -102,13 +102,13 @@ class Aged:
         return self._intake.monitor.now()
 
     def age_ns(self, stamp_ns: int, came_ns: int) -> int:
-        """Return how old is what was stamped so and came at `came_ns`, by `now_ns`: at least as long as it is there."""
+        """Return the age of something with this stamp that arrived at `came_ns` by `now_ns`, at least its time here."""
         now_ns = self.now_ns()
         return max(self._intake.monitor.stamps.age_ns(stamp_ns, now_ns), now_ns - came_ns)
 
 
 class PendingFrame:
-    """A frame that enters the map. While it is entered, others wait; a FrameRefused inside the block ends there.
+    """A frame that is being added. While it is entered, others wait; a FrameRefused inside the block ends there.
 
     Attributes:
         report: What became of the frame: set by the mapper, or on exit if the frame was refused.
@@ -134,13 +134,13 @@ class PendingFrame:
             self._intake._adding.release()
 
     def check(self, image: AnyImage | Scan) -> GateResult:
-        """Check the frame, of which `image` was made, and return what `accept` needs. Raises as `Gate.check`."""
+        """Check the frame, the source of `image`, and return what `accept` needs. Raises as `Gate.check`."""
         intake = self._intake
         with intake._map.lock:
             return intake.gate.check(self._frame, image)
 
     def accept(self, passed: GateResult, quality: str = FULL) -> None:
-        """Record that the map took the frame in; call it under the same hold of the map's lock."""
+        """Record that the frame was integrated; call it under the same hold of the map's lock."""
         intake, history = self._intake, self._intake._map.history
         history.offered(self._frame)
         history.frames += 1

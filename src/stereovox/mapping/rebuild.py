@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the part of a map anew that corrected poses change, from the frames it kept.
+"""Rebuild the part of a map that corrected poses change, from the frames it kept.
 
-What a cell holds depends on the frames that see it, in their order, and on nothing else. So only blocks that a moved
-frame saw before, or sees now, are made anew, in a map of their own, from all kept frames that see them; then they take
-the place of the old ones. Where nearly all frames do, the whole map is made anew without looking which. So are bounded
-maps: where their window was, and what had room, depends on every pose. So is a map of which only some frames are kept:
-it then is what these frames make.
+The value of a cell depends only on the frames that see it, and on their order. So only blocks that a moved frame saw
+before, or sees now, are rebuilt, in a map of their own, from all kept frames that see them; then they replace the old
+ones. If nearly all frames see them, the whole map is rebuilt without a search. So are bounded maps: every pose decides
+where their window was, and what had room. So is a map that kept only some frames: the result then is the map of these.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ from stereovox.maps.storage.blocks import CELLS, BlockPool
 from stereovox.maps.storage.storage import Storage
 
 TO_LOOK = 2
-"""What it takes to find the blocks that a moved frame sees, before and after, in mappings of a frame."""
+"""Cost of finding the blocks that a moved frame sees, before and after; the unit is mapping one frame."""
 FEW, ROUNDS = 2, 20
-"""Frames that may be missing when those that come must wait, and most rounds until they must in any case."""
+"""Backlog of frames at which new ones are made to wait, and most rounds until they are in any case."""
 CORRECTED = ", poses corrected"
-"""Behind the name of the recording that a map was made of: its next frames do not have poses that fit."""
+"""Suffix of the name of a corrected map's recording: the poses of its next frames would not fit."""
 FrameKey = int | tuple[str, int]
 """Names a frame: its stamp in nanoseconds, or sensor and stamp."""
 FramePoses = Mapping[int, Transform] | Mapping[tuple[str, int], Transform] | Mapping[FrameKey, Transform]
@@ -56,8 +55,8 @@ class CorrectionReport:
         moved: Number of frames that got another pose.
         ignored: Number of poses for which no frame is kept.
         mapped: Number of frames that were mapped again.
-        blocks: Number of blocks of 8x8x8 cells that were made anew.
-        all_frames: Whether all frames of the map are kept. Where not, the map now is what the kept ones make.
+        blocks: Number of blocks of 8x8x8 cells that were rebuilt.
+        all_frames: Whether all frames of the map are kept. If not, the map now holds only the kept ones.
     """
 
     moved: int = 0
@@ -97,10 +96,10 @@ def correct(
     no_frame_comes: AbstractContextManager[object],
     tiles: Path | None,
 ) -> CorrectionReport:
-    """Give frames of a map new poses; what is said in `Mapper.correct` holds.
+    """Give frames of a map new poses, as `Mapper.correct` describes.
 
     level: returns the quality level of a name; called by this thread, and by another one that prepares frames ahead.
-    no_frame_comes: entered while the result is put into the map; before, the map may take in frames. tiles: as in
+    no_frame_comes: entered while the result is put into the map; until then the map may accept frames. tiles: as in
     `make_map`.
     """
     kept = need_frames(storage.kept, "the map")
@@ -133,10 +132,10 @@ def need_frames(kept: KeptFrames | None, where: str) -> KeptFrames:
 
 
 def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config) -> tuple[dict[int, Transform], int]:
-    """Return the new poses by number of the frame, and how many poses are of no frame that is kept.
+    """Return the new poses by frame number, and how many poses belong to no kept frame.
 
-    Poses that a frame already has are left out. Raises StereovoxError if none is of a kept frame, where several
-    frames have a stamp that comes without its sensor, and for poses that are no rigid motions.
+    Poses that a frame already has are omitted. Raises StereovoxError if no pose belongs to a kept frame, if a stamp
+    without a sensor fits several frames, and for poses that are no rigid motions.
     """
     given: dict[FrameKey, Transform] = {key: pose for key, pose in poses.items()}  # noqa: C416 - a type checker refuses dict(poses)
     by_key: dict[FrameKey, list[KeptFrame]] = {}
@@ -147,14 +146,14 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
     if not named:
         first, last = frames[0].stamp_ns, frames[-1].stamp_ns
         raise StereovoxError(
-            f"none of the {len(poses)} poses has the stamp of a kept frame; these are from {first} to {last} ns"
+            f"none of the {len(poses)} poses has the stamp of a kept frame; their stamps are from {first} to {last} ns"
         )
     moved: dict[int, Transform] = {}
     for key, found in named.items():
         frame, sensors = found[0], sorted({frame.sensor for frame in found})
         if len(found) > 1:
             is_same = len(sensors) < len(found)
-            cure = "only maps without such can be corrected" if is_same else "name them (sensor, stamp)"
+            cure = "such a map cannot be corrected" if is_same else "name them (sensor, stamp)"
             names = ", ".join(f"'{sensor}'" for sensor in sensors)
             raise StereovoxError(f"{len(found)} frames have the stamp {frame.stamp_ns} ({names}); {cure}")
         if (frame.sensor, frame.stamp_ns) in named and key == frame.stamp_ns:
@@ -163,14 +162,14 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
                 "sensor and stamp; give one"
             )
         posed = Frame(np.empty((0, 0), np.float32), FORWARD, given[key], name=frame.name)
-        rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none
+        rigid_pose(posed, config.pose_rigidity_tolerance)  # raises if it is not rigid
         if not np.array_equal(given[key], frame.T_world_sensor):
             moved[frame.number] = np.array(given[key], float)
     return moved, len(poses) - len(named)
 
 
 def as_corrected(recording: str) -> str:
-    """Return the name of the recording of a map whose poses were corrected; "" if it has none."""
+    """Return the recording's name for a map whose poses were corrected; "" if it has none."""
     return f"{recording.removesuffix(CORRECTED)}{CORRECTED}" if recording else ""
 
 
@@ -178,11 +177,11 @@ class Rebuild:
     """A map whose poses are being corrected: `catch_up` maps kept frames again, `finish` puts the result into it.
 
     Args:
-        storage: The map; it may take in frames until `finish`.
+        storage: The map; it may accept frames until `finish`.
         level: As in `correct`.
-        moved: New poses (4, 4) by number of the frame.
+        moved: New poses (4, 4) by frame number.
         tiles: As in `correct`.
-        whole: Whether all blocks are made anew in any case.
+        whole: Whether to rebuild all blocks in any case.
     """
 
     def __init__(
@@ -208,17 +207,17 @@ class Rebuild:
 
     @property
     def behind(self) -> int:
-        """How many kept frames were not mapped again so far."""
+        """How many kept frames have not been mapped again yet."""
         return len(self._kept) - len(self._after)
 
     @property
     def outdated(self) -> bool:
-        """Whether what was made is of no use, since of the frames that came not all could be kept."""
+        """Whether the result is useless, because not all new frames could be kept."""
         dropped = self._dirty is not None and not self._kept.are_all(self._storage.history.frames)
         return dropped or self._kept.frames[: len(self._before)] != self._before
 
     def catch_up(self) -> None:
-        """Map all frames again that are kept by now and were not."""
+        """Map again all frames kept by now that have not been."""
         if self.outdated:
             return
         self._before = self._kept.frames
@@ -226,7 +225,7 @@ class Rebuild:
         again = [frame for frame in frames if self._must_be_mapped(frame)]
         coming, again = iter(again[1:]), {frame.number for frame in again}
         for frame in frames:
-            self._scratch.history.frames = frame.number  # rounding of cells of 8 bits depends on it
+            self._scratch.history.frames = frame.number  # 8-bit cells are rounded by it
             if frame.number in again:
                 self._expect(next(coming, None))
                 frame = self._mapped_again(frame)
@@ -235,7 +234,7 @@ class Rebuild:
             self._after.append(frame)
 
     def finish(self) -> CorrectionReport:
-        """Put what was made into the map, tell its listeners and return what was done. The lock must be held."""
+        """Put the result into the map, notify its listeners and return a report. The lock must be held."""
         changed, self._is_in_place = self._swap(), True
         before, after = ([(frame.sensor, frame.seen) for frame in frames] for frames in (self._before, self._after))
         self._kept.replace(self._after)
@@ -243,26 +242,26 @@ class Rebuild:
         correct_history(history, before, after)
         if self._moved:
             history.recording = as_corrected(history.recording)
-        blocks, none = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
+        blocks, zeros = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
         for listener in self._storage.listeners:
-            listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, none))
+            listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, zeros))
         all_frames = self._kept.are_all(self._storage.history.frames)
         return CorrectionReport(len(self._moved), 0, self._mapped, len(changed), all_frames)
 
     def close(self) -> None:
-        """Release what was made, where `finish` did not put it into the map."""
+        """Release the result, unless `finish` has put it into the map."""
         if not self._is_in_place:
             self._scratch.close()
 
     def _is_whole(self) -> bool:
-        """Return whether all blocks are made anew."""
+        """Return whether all blocks are rebuilt."""
         storage, first = self._storage, self._before[0]
         partly_kept = not self._kept.are_all(storage.history.frames)
         starts_anew = storage.config.map.keep_times and (first.number in self._moved or not first.blocks.any())
         return storage.bounded or partly_kept or starts_anew or self._is_less_work()
 
     def _is_less_work(self) -> bool:
-        """Return whether to map all frames again is likely less work than to find which must be."""
+        """Return whether mapping all frames again is likely less work than finding which ones must be."""
         low, high = np.stack([frame.blocks for frame in self._before], axis=1)
         near = np.zeros(len(low), bool)
         for n, frame in enumerate(self._before):
@@ -271,7 +270,7 @@ class Rebuild:
         return TO_LOOK * len(self._moved) + int(np.count_nonzero(near)) >= len(near)
 
     def _seen_by_moved(self) -> BlockPool:
-        """Return the blocks on which moved frames had evidence, or have it now."""
+        """Return the blocks on which moved frames had evidence, or now have it."""
         seen = BlockPool(np.uint8, cells=1)
         for frame in self._before:
             if frame.number in self._moved:
@@ -283,24 +282,24 @@ class Rebuild:
         return seen
 
     def _posed(self, frame: KeptFrame) -> KeptFrame:
-        """Return a frame at its new pose, itself if it has none."""
+        """Return a frame at its new pose, or unchanged if it has none."""
         pose = self._moved.get(frame.number)
         return frame if pose is None else replace(frame, T_world_sensor=pose)
 
     def _must_be_mapped(self, frame: KeptFrame) -> bool:
-        """Return whether a frame may have evidence on blocks that are made anew."""
+        """Return whether a frame may have evidence on blocks that are rebuilt."""
         if self._dirty is None or frame.number in self._moved:
             return True
         coords, (low, high) = self._dirty.coords[: len(self._dirty)], frame.blocks
         return bool(((coords >= low) & (coords < high)).all(axis=1).any())
 
     def _expect(self, frame: KeptFrame | None) -> None:
-        """Begin to prepare the frame that will be mapped next, if there is a thread for it."""
+        """Begin to prepare the frame that will be mapped next, if a thread is free for it."""
         if frame is not None and self._storage.config.threads > 1:
             self._loaded.begin(frame)
 
     def _mapped_again(self, frame: KeptFrame) -> KeptFrame:
-        """Map a frame, and return it with what it sees from its pose."""
+        """Map a frame, and return it with the blocks that it sees from its pose."""
         image = self._loaded(frame).image
         evidence = self._level(frame.quality).integrator.evidence(image)
         seen = StampedPose(frame.seen.stamp_ns, tuple(image.T_world_sensor.ravel().tolist()[:12]))
@@ -313,7 +312,7 @@ class Rebuild:
         return frame
 
     def _part(self, evidence: Evidence) -> Evidence:
-        """Return the evidence on blocks that are made anew."""
+        """Return the evidence on blocks that are rebuilt."""
         if self._dirty is None:
             return evidence
         mixed, free = (_is_in(self._dirty, coords) for coords in (evidence.coords, evidence.uniform))
@@ -328,7 +327,7 @@ class Rebuild:
             raise StereovoxError(f"from the corrected poses, {error}; nothing was changed") from None
 
     def _swap(self) -> NDArray[np.int32]:
-        """Put the blocks that were made anew into the map; return their coordinates (n, 3)."""
+        """Put the rebuilt blocks into the map; return their coordinates (n, 3)."""
         storage, scratch, last = self._storage, self._scratch, self._before[-1]
         if self._dirty is not None:
             changed = self._dirty.coords[: len(self._dirty)].copy()

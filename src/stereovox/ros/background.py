@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work in a thread of its own, while the node's thread goes on receiving messages."""
+"""Work in a thread of its own, while the node's thread keeps receiving messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Background(Generic[T]):
-    """Does one piece of work after the other. One thread, the node's, calls all methods.
+    """Runs tasks in order. One thread, the node's, calls all methods.
 
     name: of the thread.
     """
@@ -23,7 +23,7 @@ class Background(Generic[T]):
         self._running: Future[T] | None = None
 
     def put(self, work: Callable[[], T], newest_only: bool = False) -> None:
-        """Add a piece of work; newest_only: in the place of all that has not begun yet."""
+        """Add a task; newest_only: it replaces all tasks that have not begun yet."""
         if newest_only:
             self._waiting.clear()
         self._waiting.append(work)
@@ -31,7 +31,7 @@ class Background(Generic[T]):
             self._begin()
 
     def poll(self) -> Future[T] | None:
-        """Return a piece of work that has ended, if any, and begin the next one."""
+        """Return the task that has ended, if any, and begin the next one."""
         if self._running is None or not self._running.done():
             return None
         ended = self._running
@@ -39,7 +39,7 @@ class Background(Generic[T]):
         return ended
 
     def rest(self) -> Iterator[Future[T]]:
-        """Do all that is left; yield each piece of work when it has ended."""
+        """Run all remaining tasks; yield each when it has ended."""
         while self._running is not None:
             wait([self._running])
             ended = self.poll()
@@ -47,7 +47,7 @@ class Background(Generic[T]):
                 yield ended
 
     def drop(self) -> None:
-        """Forget all that has not begun, and wait for what has."""
+        """Discard all tasks that have not begun, and wait for the one that has."""
         self._waiting.clear()
         if self._running is not None:
             wait([self._running])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert messages (CDR bytes) to frames and scans with the bag readers, so that a bag and its replay give the same.
 
-A frame waits for its pose, so a message is read twice: `header` gives its time and frame, `frame` converts it. Whatever
-a message holds, `frame` returns a frame: with a `fault` if it cannot be used.
+A frame waits for its pose, so a message is read twice: `header` gives its time and frame, `frame` converts it. `frame`
+always returns a frame, whatever the message holds: with a `fault` if it cannot be used.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from stereovox.sources.robots.bag import posed_scan
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 
 LONGEST_SWEEP_S = 0.5
-"""Seconds of a turn of a lidar; clouds whose points have later times do not wait for their poses."""
+"""Most seconds of a lidar's sweep; clouds whose points have later times do not wait for the poses of these."""
 NO_POSE = np.full((4, 4), np.nan)
 NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
 PoseLookup = Callable[[str, int], Pose]
@@ -49,7 +49,7 @@ class Input(Protocol):
 
     @property
     def ready(self) -> bool:
-        """Whether everything but the pose is there to convert messages."""
+        """Whether everything needed to convert messages, except the pose, is there."""
         return True
 
     def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
@@ -57,15 +57,15 @@ class Input(Protocol):
         return poses.is_final(frame_id, stamp_ns)
 
     def frame(self, data: bytes, where: PoseLookup) -> Frame | Cloud | Scan | None:
-        """Convert a message; the `fault` of the result says why it cannot be used. None: it is not to be mapped."""
+        """Convert a message; the `fault` of the result says why it cannot be used. None: do not map it."""
         ...
 
     def look_up(self, poses: PoseBuffer) -> PoseLookup:
-        """Return what looks up the poses that `frame` asks for."""
+        """Return the function by which `frame` looks up poses."""
         return poses.pose
 
     def view(self, data: bytes, stamp_ns: int) -> Frame | Cloud:
-        """Return what a message shows of its sensor's motion: a depth image without its pose, else an empty cloud."""
+        """Return the evidence of a message about its sensor's motion: a depth image without pose, or an empty cloud."""
         name = _frame_title(self.topic, stamp_ns)
         return Cloud(np.empty((0, 3), np.float32), NO_POSE, stamp_ns, name=name, sensor=self.topic)
 
@@ -84,7 +84,7 @@ class DepthInput(Input):
         self.kind = "sensor_msgs/CompressedImage" if self._packed else "sensor_msgs/Image"
         self.info = info or sibling(plain_topic(topic), "camera_info")
         self._camera: PinholeCamera | None = None
-        self._trouble = f"{topic}: no camera_info came on {self.info}; name its topic: --depth {topic}=INFO"
+        self._trouble = f"{topic}: no camera_info on {self.info}; name its topic: --depth {topic}=INFO"
 
     @property
     def ready(self) -> bool:
@@ -127,9 +127,9 @@ class DepthInput(Input):
 
 
 class CloudInput(Input):
-    """Point clouds for a 3-D map, a ray for each point. Where points have times, poses of the sweep straighten it.
+    """Point clouds for a 3-D map, a ray for each point. If points have times, poses during the sweep deskew it.
 
-    lidar: what their ranges can be trusted for.
+    lidar: the reliability of their ranges.
     """
 
     kind = "sensor_msgs/PointCloud2"
@@ -138,7 +138,7 @@ class CloudInput(Input):
         self.topic, self._lidar, self._sweep_ns = topic, lidar, 0
 
     def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
-        """Return whether no later message can change a pose of a cloud's sweep, if it is as long as the one before."""
+        """Return whether no later message can change a pose of a cloud's sweep, if it is as long as the last one."""
         return poses.is_final(frame_id, stamp_ns + self._sweep_ns)
 
     def frame(self, data: bytes, where: PoseLookup) -> Cloud:
@@ -157,7 +157,7 @@ class CloudInput(Input):
 
 
 class RaysInput(Input):
-    """Scans of a 2-D lidar for a 3-D map, a ray for each beam. options: what their ranges can be trusted for."""
+    """Scans of a 2-D lidar for a 3-D map, a ray for each beam. options: the reliability of their ranges."""
 
     kind = "sensor_msgs/LaserScan"
 
@@ -174,7 +174,7 @@ class RaysInput(Input):
 
 
 class FloorCloudInput(Input):
-    """Point clouds for a floor map, reduced to what a 2-D lidar would see (`sources.cloud_scan`)."""
+    """Point clouds for a floor map, reduced to the view of a 2-D lidar (`robots.cloud_scan`)."""
 
     kind = "sensor_msgs/PointCloud2"
 
@@ -218,7 +218,7 @@ class ScanInput(Input):
 
 
 def _cloud_at(cloud: Cloud, topic: str, where: PoseLookup, frame_id: str) -> Cloud:
-    """Return a cloud from where its sensor was. Raises FrameRefused."""
+    """Return a cloud at the pose of its sensor. Raises FrameRefused."""
     T_world_sensor, _, off_ns = where(frame_id, cloud.stamp_ns)
     name = _frame_title(topic, cloud.stamp_ns)
     return replace(cloud, T_world_sensor=T_world_sensor, pose_off_ns=off_ns, name=name, sensor=topic)

@@ -12,14 +12,14 @@ from stereovox.errors import MissingExtra, StereovoxError
 
 NAME = "stereovox"
 REQUIRED = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "std_srvs")
-"""Packages that the node cannot do without."""
+"""Packages that the node needs."""
 
 
 @contextmanager
 def running_node(arguments: Sequence[str], make: Callable[..., Any] | None = None) -> Iterator[Any]:
     """Yield an rclpy node with the parameters in `arguments`, those after --ros-args.
 
-    make: makes the node, by its name and rclpy's arguments; None: a plain one. Signal handlers stay as they are. Raises
+    make: makes the node from its name and rclpy's arguments; None: a plain one. Signal handlers stay unchanged. Raises
     StereovoxError, one line, for arguments unknown to ROS.
     """
     import rclpy
@@ -28,7 +28,7 @@ def running_node(arguments: Sequence[str], make: Callable[..., Any] | None = Non
     try:
         rclpy.init(args=["--ros-args", *arguments], signal_handler_options=SignalHandlerOptions.NO)
         node = (make or rclpy.create_node)(NAME, automatically_declare_parameters_from_overrides=True)
-    except Exception as error:  # rclpy's C library has many
+    except Exception as error:  # rclpy's C library raises many kinds
         raise StereovoxError(f"--ros-args {' '.join(arguments)}: {error}") from None
     try:
         yield node
@@ -43,7 +43,7 @@ def check_installed() -> None:
         try:
             import_module(package)
         except ImportError:
-            raise MissingExtra(f"{package} of ROS 2 (source a distribution, or take the wheels)", "ros2") from None
+            raise MissingExtra(f"{package} of ROS 2 (source a distribution, or install the wheels)", "ros2") from None
 
 
 def optional_message(package: str, name: str) -> Any | None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a managed one (ROS 2's lifecycle): configure, activate, deactivate, cleanup, shutdown.
 
-Unconfigured it has no topics. Configured it has them, and knows poses, but maps nothing until it is active. At cleanup
-the map is saved and everything is taken away; the next configuration reads the parameters anew.
+Unconfigured, it has no topics. Configured, it has them and knows poses, but maps nothing until it is active. Cleanup
+saves the map and destroys everything; the next configuration reads the parameters again.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ CREATE = {
     "create_subscription": "destroy_subscription",
     "create_service": "destroy_service",
 }
-"""What makes an entity of a node, and what destroys it."""
+"""Methods that make the entities of a node, and those that destroy them."""
 
 
 class Entities:
-    """Stands for a node while something is made, and destroys all that was made."""
+    """Stands in for a node, records the entities that are made, and destroys them."""
 
     def __init__(self, node: Any):
         self._node = node
@@ -41,7 +41,7 @@ class Entities:
         return partial(self._create, name) if name in CREATE else getattr(self._node, name)
 
     def destroy(self) -> None:
-        """Destroy all publishers, subscriptions and services that were made."""
+        """Destroy all recorded publishers, subscriptions and services."""
         while self._made:
             name, one = self._made.pop()
             getattr(self._node, CREATE[name])(one)
@@ -53,10 +53,10 @@ class Entities:
 
 
 class Managed(Run[None, dict[str, Any]]):
-    """Holds at most one `NodeRun`, as the node's state says, until the node is shut down, or by a signal.
+    """Holds at most one `NodeRun`, by the node's state, until the node is shut down or a signal arrives.
 
-    begin: called at configuration with what stands for the node, returns an entered run; may raise StereovoxError,
-    and then it failed.
+    begin: called at configuration with the stand-in for the node, returns an entered run; if it raises StereovoxError,
+    the configuration has failed.
     """
 
     usual_end = (KeyboardInterrupt,)
@@ -80,16 +80,16 @@ class Managed(Run[None, dict[str, Any]]):
             yield
 
     def _take(self, step: None) -> None:
-        """Receive messages and calls, and map one frame where the node is active."""
+        """Receive messages and calls, and map one frame if the node is active."""
         if self._run is None:
             self._executor.spin_once(timeout_sec=IDLE_S)
             return
         self._run.step()
-        if self._over:  # not in the callback: topics would vanish while their messages are received
+        if self._over:  # not in the callback: topics would vanish while their messages arrive
             self._end()
 
     def _end(self) -> dict[str, Any]:
-        """End the run, if any, and take away its topics; return the figures of the last one."""
+        """End the run, if any, and destroy its topics; return the figures of the last run."""
         run, self._run, self._over = self._run, None, False
         if run is not None:
             try:
@@ -100,9 +100,9 @@ class Managed(Run[None, dict[str, Any]]):
         return self._report
 
     def configure(self) -> bool:
-        """Make the topics and an empty map; return whether that was possible."""
-        if self._over:  # both were asked for before the last run could end
-            self._node.get_logger().error("not configured: the last map is still being saved; configure it again")
+        """Make the topics and an empty map; return whether that succeeded."""
+        if self._over:  # cleanup and configuration were requested before the last run could end
+            self._node.get_logger().error("not configured: the last map is still being saved; configure again later")
             return False
         try:
             self._run = self._begin_run(self._entities)
@@ -116,7 +116,7 @@ class Managed(Run[None, dict[str, Any]]):
         return True
 
     def activate(self, active: bool) -> None:
-        """Map from now on, or no longer."""
+        """Start or stop mapping."""
         if self._run is not None:
             self._run.map_node.active = active
 
@@ -131,7 +131,7 @@ class Managed(Run[None, dict[str, Any]]):
 
 
 def managed_node(name: str, **kwargs: Any) -> Any:
-    """Return an unconfigured `rclpy.lifecycle.LifecycleNode` whose transitions go to the `Managed` that takes it."""
+    """Return an unconfigured `rclpy.lifecycle.LifecycleNode` whose transitions go to its `Managed`."""
     from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
     done, failed = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Nav2's map_server offers: a floor map on `/map`, and to who asks for it."""
+"""A stand-in for Nav2's map_server: a floor map on `/map` and on request."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAP, GET_MAP = "map", "map_server/map"
 class MapServer:
     """Publishes a floor map on `/map`, and answers `/map_server/map` (nav_msgs/GetMap) with it.
 
-    frame_id: the map's frame. Until there is a map the answer is an empty one of 0 x 0 cells.
+    frame_id: the map's frame. Until there is a map, the answer is an empty one of 0 x 0 cells.
     """
 
     def __init__(self, node: Any, frame_id: str):

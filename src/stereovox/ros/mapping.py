@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map of the node: owns the mapper and replaces it when a map is loaded or reset."""
+"""The map of the node: owns the mapper, and replaces it when a map is loaded or reset."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]
 
 
 class Mapping:
-    """A 3-D map or a floor map, as the settings say, and its 2-D projection.
+    """A 3-D map or a floor map, by the settings, and its 2-D projection.
 
     heights: metres above the floor that a robot occupies, for the 2-D map of a 3-D map. tiles: folder for cells outside
-    the window. notify: called once with a line, if a map in space shows no floor.
+    the window. notify: called once with a line if a 3-D map shows no floor.
 
     Attributes:
         mapper: The current mapper; `load` and `reset` replace it.
-        corrections: Corrections in progress, in a thread of their own. Another map does not wait for those that wait.
+        corrections: Corrections in progress, in a thread of their own. Replacing the map drops those not begun.
     """
 
-    mapper: AnyMapper[Any]  # the node offers it only what its options allow
+    mapper: AnyMapper[Any]  # the node gives it only frames that its options allow
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Mapping:
         return self.mapper.map.history
 
     def stamps_by(self, clock: StampsBy) -> None:
-        """Say by which clock frames are stamped, as `Mapper.stamp_clock`; of later mappers, too."""
+        """Set the clock of the frames' stamps, as `Mapper.stamp_clock`, for this mapper and later ones."""
         self._stamp_clock = self.mapper.stamp_clock = clock
 
     def add(self, frame: Frame | Cloud | Scan) -> UpdateReport:
@@ -76,7 +76,7 @@ class Mapping:
     def correct(self, poses_of: PosesOf, newest_only: bool = False) -> None:
         """Correct the map in the background.
 
-        poses_of: called there with the kept frames, returns new poses by sensor and stamp. newest_only: in the place of
+        poses_of: called there with the kept frames, returns new poses by sensor and stamp. newest_only: replace
         corrections that have not begun yet.
         """
         if isinstance(self.mapper, Mapper):
@@ -95,7 +95,7 @@ class Mapping:
         voxel_map = self.mapper.map
         if not isinstance(voxel_map, VoxelMap):
             return None
-        with voxel_map.lock:  # a correction may be at work
+        with voxel_map.lock:  # a correction may be running
             coords, cells = voxel_map.storage.blocks_within(*EVERYWHERE)
 
         def copy() -> VoxelMap:
@@ -110,13 +110,13 @@ class Mapping:
         self.mapper.save(path)
 
     def load(self, path: str) -> None:
-        """Continue a saved map; raises StereovoxError, and changes nothing, where that is impossible."""
+        """Continue a saved map; raises StereovoxError, and changes nothing, if that is impossible."""
         if self.config.dimensions == 2:
             floor = read_map_server(path)
             self._begin_floor(load_config(self.config, voxel_size=floor.resolution), floor)
         else:
             saved = load_map(path)
-            saved.storage.check_cells(self.config)  # before the map in use is given up
+            saved.storage.check_cells(self.config)  # before the current map is closed
             self.close()
             self._begin_space(self.config, saved)
 
@@ -126,7 +126,7 @@ class Mapping:
         self._begin(self.config)
 
     def close(self) -> None:
-        """Release the files that the map holds open, once the correction in progress has ended."""
+        """Release the map's open files, once the correction in progress has ended."""
         self.corrections.drop()
         self.mapper.close()
 

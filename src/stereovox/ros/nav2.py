@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launch file and parameters with which Nav2 plans in a live map."""
+"""Launch file and parameters for Nav2 to plan in a live map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import check_local, read_text, replacing, yaml_value
 
 OURS, LAUNCH, RESULT = "nav2.yaml", "nav2.launch.py", "nav2_params.yaml"
-"""Our parameters, the launch file, and the file that is made for Nav2."""
+"""Our parameters, the launch file, and the file that is written for Nav2."""
 COPIED = (LAUNCH, "stereovox.rviz", "foxglove.json")
 THEIRS = Path("share/nav2_bringup/params/nav2_params.yaml")
 
@@ -20,18 +20,18 @@ THEIRS = Path("share/nav2_bringup/params/nav2_params.yaml")
 def write_nav2(folder: str | Path, params: str | Path | None = None) -> list[Path]:
     """Write launch file, parameters and displays for Nav2.
 
-    `nav2_params.yaml` is a whole file of Nav2's parameters with ours laid over it: the map as static layer, obstacles
-    and free rays as observation sources, and the Collision Monitor's source.
+    `nav2_params.yaml` is a whole file of Nav2's parameters, overridden by ours: the map as static layer, obstacles and
+    free rays as observation sources, and the Collision Monitor's source.
 
     Args:
-        folder: Where to; made if it is missing. Older files of these names are replaced.
-        params: The `nav2_params.yaml` to lay ours over; None: that of the sourced distribution's nav2_bringup.
+        folder: The target folder, created if missing. Older files of these names are replaced.
+        params: The `nav2_params.yaml` to override; None: that of the sourced distribution's nav2_bringup.
 
     Returns:
         The files.
 
     Raises:
-        StereovoxError: There is no such file, it is not one of parameters, or the folder cannot be written.
+        StereovoxError: The file is missing or holds no parameters, or the folder cannot be written.
     """
     import yaml
 
@@ -44,7 +44,7 @@ def write_nav2(folder: str | Path, params: str | Path | None = None) -> list[Pat
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StereovoxError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
+        raise StereovoxError(f"{folder}: cannot be created ({error.strerror}); choose another folder") from None
     for path, data in zip(paths, written.values(), strict=True):
         with replacing(path, StereovoxError) as file:
             file.write(data)
@@ -57,7 +57,7 @@ def overlay() -> dict[str, Any]:
 
 
 def laid_over(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return `base` with the values of `over` in it, tables within tables; lists are replaced as a whole."""
+    """Return `base` overridden by the values of `over`, also in nested tables; lists are replaced as a whole."""
     merged = dict(base)
     for name, value in over.items():
         both = isinstance(value, dict) and isinstance(merged.get(name), dict)

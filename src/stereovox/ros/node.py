@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node: messages wait for their pose, become frames and update the map, which is published.
 
-Everything runs in one thread between two waits for messages, so nothing needs a lock and services run between frames;
-but the map is corrected, and large messages are made, in threads of their own.
+Everything runs in one thread between two waits for messages, so nothing needs a lock, and services run between frames.
+Only corrections of the map and large messages have threads of their own.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from stereovox.sources.waiting import Arrival, Waiting
 IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when idle, and while frames are waiting."""
 MAX_AT_ONCE = 256
-"""Messages that are received before the next frame is mapped."""
+"""Most messages received before the next frame is mapped."""
 
 
 class Message(NamedTuple):
-    """A message to map, as bytes; what was known of its stamp when it arrived, and what was added to it."""
+    """A message to map, as bytes; what was known about its stamp when it arrived, and the shift added to the stamp."""
 
     data: bytes
     heard: Heard = Heard()
@@ -55,7 +55,7 @@ class MapNode:
     Attributes:
         waiting: Messages that wait for their pose.
         received: Number of messages to map, by topic.
-        active: Whether frames are mapped; else they are left, and nothing is published.
+        active: Whether frames are mapped; otherwise they are dropped, and nothing is published.
 
     Raises StereovoxError, one line, for invalid options.
     """
@@ -131,9 +131,9 @@ class MapNode:
         self._silence.update()
 
     def close(self) -> dict[str, Any]:
-        """Map all waiting frames, correct the map as was asked, publish the final one; return figures for the report.
+        """Map all waiting frames, finish corrections, publish the final map; return figures for the report.
 
-        Keys: `localisation`, `slam`, `slam_map` (an OccupancyGrid), `error`; each if there is such a thing.
+        Keys: `localisation`, `slam`, `slam_map` (an OccupancyGrid), `error`; each only if it exists.
         """
         while (arrival := self.waiting.pop(lambda one: True)) is not None:
             self._map(arrival)
@@ -145,8 +145,8 @@ class MapNode:
         return {**self._source.finish(), **({"error": error} if error else {})}
 
     def _receive(self, wait_s: float) -> None:
-        """Wait for messages and receive all that are there."""
-        idle = 0  # rclpy returns without a message once after each round of ready ones, even if more have arrived
+        """Wait for messages and receive all that have arrived."""
+        idle = 0  # rclpy returns once without a message after each round of ready ones, even if more have arrived
         for _ in range(MAX_AT_ONCE):
             before = self._subscriptions.messages
             self._executor.spin_once(timeout_sec=wait_s)
@@ -159,7 +159,7 @@ class MapNode:
         self.received[topic] += 1
         try:
             stamp_ns, frame_id = header(data)
-        except ValueError:  # no pose to wait for: it is refused in its turn
+        except ValueError:  # no pose to wait for: the message is refused in its turn
             self.waiting.put(topic, 0, "", Message(data))
             return
         shift_ns = self._clocks.shift_ns(topic)
@@ -183,7 +183,7 @@ class MapNode:
     def _map(self, one: Arrival[Message]) -> None:
         sensor, shift_ns = self._inputs[one.sensor], one.content.shift_ns
         frame = sensor.frame(one.content.data, self._look_up(one))
-        if frame is None:  # it told where the robot is, and is not to be mapped
+        if frame is None:  # it served to localise the robot, and is not mapped
             return
         if shift_ns:
             frame = replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
@@ -195,11 +195,11 @@ class MapNode:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)
         else:
             self._outputs.changed(one.stamp_ns, self._poses.world)
-            where = self._poses.pose(one.frame_id, one.stamp_ns)  # once more: where the robot is
+            where = self._poses.pose(one.frame_id, one.stamp_ns)  # again, for the pose of the robot
             self._obstacles.seen(one.stamp_ns, self._poses.world, where.T_world_sensor @ inverse(where.T_base_sensor))
 
     def _look_up(self, one: Arrival[Message]) -> PoseLookup:
-        """Return what looks poses up for a message by the stamps that it bears, or refuses to if they are in doubt."""
+        """Return the function that looks up poses for a message by its own stamps, or refuses if these are in doubt."""
         sensor, (data, heard, shift_ns) = self._inputs[one.sensor], one.content
         look_up = sensor.look_up(self._poses)
         try:
@@ -215,7 +215,7 @@ class MapNode:
         return lambda frame_id, stamp_ns: look_up(frame_id, stamp_ns + shift_ns)
 
     def _take(self, ended: Future[CorrectionReport]) -> None:
-        """Publish what a correction has changed, or say why it has not."""
+        """Publish a correction, or log why it failed."""
         try:
             report = ended.result()
         except StereovoxError as error:
@@ -225,7 +225,7 @@ class MapNode:
         if report.moved:
             self._corrections["corrections"] += 1
             self._outputs.corrected()
-            self._node.get_logger().info(f"corrected: {report.moved} frames moved, {report.mapped} were mapped again")
+            self._node.get_logger().info(f"corrected: {report.moved} frames moved, {report.mapped} mapped again")
 
     def _renewed(self) -> Any:
         self.waiting.clear()

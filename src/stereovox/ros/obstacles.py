@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a local planner needs of the map: obstacles round the robot, and how far it is free, as Nav2's costmaps take it.
+"""The input of a local planner: obstacles around the robot and the extent of free space, for Nav2's costmaps.
 
-A costmap keeps what was once marked until a ray of a clearing source sweeps over it, and it takes no other word for it
-that something is gone. So there are two clouds of one time: `obstacles` to mark, and `free_rays`, the last free cells
-in all directions, to clear up to. Both come from the map, which has weighed all that was seen.
+A costmap keeps a marked cell until a ray of a clearing source passes over it; nothing else removes it. So there are two
+clouds with one stamp: `obstacles` to mark, and `free_rays`, the last free cells in all directions, to clear up to. Both
+come from the map, which has weighed all evidence.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from stereovox.ros.outputs import points_message
 OBSTACLES, FREE_RAYS = "obstacles", "free_rays"
 """Topics."""
 STEP = 0.5
-"""Cells from one place on a ray to the next."""
+"""Cells between samples on a ray."""
 
 
 def obstacle_points(grid: OccupancyGrid, place: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
@@ -40,10 +40,10 @@ def obstacle_points(grid: OccupancyGrid, place: NDArray[np.float64], reach: floa
 
 
 def free_ends(grid: OccupancyGrid, place: NDArray[np.float64], reach: float, blind: float) -> NDArray[np.float64]:
-    """Return how far it is free round a place (2,): the last free cell's centre (N, 2) in each direction that has any.
+    """Return the centres (N, 2) of the last free cells around a place (2,), one in each direction that has any.
 
     A ray ends before the first cell that is not free. Unknown cells up to `blind` metres do not end it, since a camera
-    does not see what is at its feet; others do: they may be anything. Rays are one cell apart at `reach` metres.
+    does not see the floor at its feet; others do: they may be anything. Rays are one cell apart at `reach` metres.
     """
     fan, distances = _fan(round(reach / grid.resolution))
     at = se2.transform(se2.inverse(grid.origin), place[None])[0] / grid.resolution  # in cells: column, row
@@ -60,16 +60,16 @@ def free_ends(grid: OccupancyGrid, place: NDArray[np.float64], reach: float, bli
 
 @lru_cache(maxsize=4)
 def _fan(reach: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return places on rays in all directions, (2, rays, steps) x and y in cells, and their distances (steps,)."""
+    """Return samples on rays in all directions, (2, rays, steps) x and y in cells, and their distances (steps,)."""
     distances = np.arange(STEP, reach, STEP, dtype=np.float32)
     angles = np.arange(0.0, 2 * np.pi, 1 / reach)
-    ways = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
-    return ways[:, :, None] * distances, distances
+    directions = np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+    return directions[:, :, None] * distances, distances
 
 
 def _window(grid: OccupancyGrid, at: NDArray[np.float64], steps: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return the states of all cells that rays may reach, unknown outside of the picture, and column and row of the
-    first."""
+    """Return column and row of the first cell that rays may reach, and the states of all such cells, unknown outside
+    the grid."""
     half = int(np.ceil(steps * STEP)) + 2
     corner, (rows, columns) = np.floor(at).astype(np.int64) - half, grid.cells.shape
     cells = np.full((2 * half + 1, 2 * half + 1), UNKNOWN, np.int8)
@@ -81,11 +81,11 @@ def _window(grid: OccupancyGrid, at: NDArray[np.float64], steps: int) -> tuple[N
 
 
 class Obstacles:
-    """Publishes both clouds while frames come that can be trusted; with the stamp of the newest one.
+    """Publishes both clouds while trusted frames arrive, with the stamp of the newest one.
 
-    Without such frames nothing is published, so that who needs to know that the map is current can tell by the stamps;
-    neither while what any sensor's newest frame shows is older than `trust.stale_s`, since what it looks at may be free
-    no longer. clock: monotonic seconds.
+    Without such frames nothing is published, so that stamps show whether the map is current. Nor is anything published
+    while any sensor's newest frame is older than `trust.stale_s`, since its view may no longer be free. clock:
+    monotonic seconds.
     """
 
     def __init__(self, node: Any, mapping: Mapping, options: Options, clock: Callable[[], float] = monotonic):
@@ -98,7 +98,7 @@ class Obstacles:
         self._height = sum(options.heights or mapping.config.scan.heights) / 2
 
     def seen(self, stamp_ns: int, world: str, T_world_base: Transform) -> None:
-        """Take in that a frame was mapped, and where the robot was."""
+        """Record that a frame was mapped, and the robot's pose."""
         self._newest = stamp_ns, world, T_world_base[:2, 3]
 
     def update(self) -> None:
@@ -127,7 +127,7 @@ class Obstacles:
             publisher.publish(points_message(lifted, stamp_ns, world))
 
     def _stale(self) -> str:
-        """Return which sensor's newest trusted frame is too old, if any."""
+        """Return a line about a sensor whose newest trusted frame is too old; "" for none."""
         ages_s, most_s = self._mapping.health().ages_s, self._mapping.config.trust.stale_s
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1], default=("", 0.0))
         stale = age_s > most_s

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of the node besides the settings of the map: topics, frames, times.
+"""Options of the node, in addition to the settings of the map: topics, frames, times.
 
 ROS parameters are settings of the map by their own names, and options of the node with the prefix `ros.`. They are read
-once, at the start; only `ros.out` may be set later.
+once, at the start; only `ros.out` may change later.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ class Options:
     depth: topics of depth images; `TOPIC=INFO` if the camera_info is not next to it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
-    poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images;
-    `slam`, by SLAM with the scans of `lidar`, or the `.yaml` of a map that the robot is localised in by them.
+    poses: `given`, from tf and the topics above; `track`, from the first depth camera by visual odometry; `slam`, by
+    SLAM with the scans of `lidar`; or the `.yaml` of a map in which these scans localise the robot.
     lidar: topic of those scans; "": the first of `scan`. start: `X,Y,DEG`, first pose of the robot in the map, metres
-    and degrees; "": anywhere. publish_tf: publish tracked poses, or where the odometry is in the map, on /tf;
+    and degrees; "": anywhere. publish_tf: publish tracked poses, or the odometry's frame in the map, on /tf;
     tf_tolerance_s: seconds by which the latter is dated ahead.
-    reference: `.yaml` of a map that the 2-D map is compared with; "": that which the robot is localised in.
-    exclude: regions of it that do not count, `X0,Y0,X1,Y1` in metres. slam_out: where SLAM's map is saved; "": nowhere.
-    world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected to the sensors first.
+    reference: `.yaml` of a map to compare the 2-D map with; "": the map in which the robot is localised.
+    exclude: regions of it that do not count, `X0,Y0,X1,Y1` in metres. slam_out: file for SLAM's map; "": none.
+    world_frame: the frame of the map; "": `map` or `odom`, whichever is connected to the sensors first.
     base_frame: frame of the robot, on the floor, for floor maps; "": `base_footprint`, else `base_link`.
     wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may then be extrapolated.
     apart_s: seconds by which frames and poses of the same time may arrive apart at the start; more: clocks differ.
-    late_s: a frame that has waited this long for a busy map gives way to newer ones. queue: frames that wait per topic.
-    map_rate, cloud_rate, obstacle_rate: largest rate in messages a second: of the 2-D map, of the cloud and the
-    OctoMap, and of obstacles and free rays. obstacle_range: metres round the robot in which those are; blind_m: metres
+    late_s: a frame that has waited this long for a busy map yields to newer ones. queue: waiting frames per topic.
+    map_rate, cloud_rate, obstacle_rate: largest rate in messages per second: of the 2-D map, of the cloud and the
+    OctoMap, and of obstacles and free rays. obstacle_range: radius of those around the robot in metres; blind_m: metres
     up to which unknown cells do not end a free ray.
-    low, high: metres above the floor that the robot occupies, for the 2-D map; NaN: those of the settings.
+    low, high: metres above the floor that the robot occupies, for the 2-D map; NaN: as in the settings.
     full_octomap: publish log-odds, not only occupied and free.
     lidar_sigma: standard deviation of the ranges of clouds and scans in metres. lidar_min, lidar_max: metres below
-    which their points are left out, and beyond which they are no surfaces (0: no limit).
-    corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: whose poses they are; "":
+    which their points are dropped, and beyond which they are no surfaces (0: no limit).
+    corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: frame whose poses it holds; "":
     that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the path since the last one.
-    odom_frame: frame of the odometry. reliable: reliable delivery of images. out: where the map is saved; "": nowhere.
+    reliable: request reliable delivery of images. out: where to save the map; "": nowhere.
     """
 
     depth: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ class Options:
                 raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give seconds, 0 to 60")
         for name in ("map_rate", "cloud_rate", "obstacle_rate"):
             if not 0 < getattr(self, name) <= 1000:
-                raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give messages a second, above 0")
+                raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give messages per second, above 0")
         if not 0.1 <= self.obstacle_range <= 100:
             raise StereovoxError(f"{PREFIX}obstacle_range {self.obstacle_range:g}: give metres, 0.1 to 100")
         if not 0 <= self.blind_m <= self.obstacle_range:
@@ -129,17 +129,17 @@ class Options:
 
     @property
     def heights(self) -> tuple[float, float] | None:
-        """Metres above the floor that the robot occupies, for the 2-D map; None: those of the settings."""
+        """Metres above the floor that the robot occupies, for the 2-D map; None: as in the settings."""
         return None if math.isnan(self.low) else (self.low, self.high)
 
     @property
     def ranges(self) -> LidarOptions:
-        """What the ranges of clouds and scans can be trusted for."""
+        """The reliability of the ranges of clouds and scans."""
         return LidarOptions(self.lidar_sigma, self.lidar_min, self.lidar_max)
 
     @property
     def floor(self) -> str:
-        """File of the map that the robot is localised in; "": none."""
+        """File of the map in which the robot is localised; "" for none."""
         return self.poses if Path(self.poses).suffix.lower() in FLOOR_READABLE else ""
 
     @property
@@ -148,11 +148,11 @@ class Options:
         return self.poses == SLAM or bool(self.floor)
 
     def check_sources(self) -> Options:
-        """Return these options; raises StereovoxError for no input topic or one that cannot be used with others."""
+        """Return these options; raises StereovoxError without an input topic, or if options exclude each other."""
         if not (self.depth or self.cloud or self.scan or (self.localised and self.lidar)):
             raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
         if self.poses == TRACK and not self.depth:
-            raise StereovoxError("--poses track: a depth camera is tracked; give --depth, or the poses: --poses given")
+            raise StereovoxError("--poses track: it needs a depth camera; give --depth, or poses by --poses given")
         if self.poses == TRACK and (self.odometry or self.pose):
             given = "--odometry" if self.odometry else "--pose"
             topic = (self.odometry or self.pose)[0]
@@ -162,15 +162,15 @@ class Options:
 
     def _check_localisation(self) -> None:
         if self.localised and not (self.lidar or self.scan):
-            raise StereovoxError(f"--poses {self.poses}: scans tell where the robot is; give --lidar /scan")
+            raise StereovoxError(f"--poses {self.poses}: it localises the robot by scans; give --lidar /scan")
         if self.lidar and not self.localised:
             raise StereovoxError(f"--lidar {self.lidar}: is for --poses slam or MAP.yaml; to map scans, give --scan")
         if self.start and not self.floor:
-            raise StereovoxError(f"--start {self.start}: says where in a map; give it as well: --poses MAP.yaml")
+            raise StereovoxError(f"--start {self.start}: is a pose in a map; give the map: --poses MAP.yaml")
         if self.slam_out and self.poses != SLAM:
-            raise StereovoxError(f"--slam-out {self.slam_out}: is SLAM's map; add --poses slam")
+            raise StereovoxError(f"--slam-out {self.slam_out}: is for SLAM's map; add --poses slam")
         if self.exclude and not (self.reference or self.floor):
-            raise StereovoxError(f"--exclude {self.exclude[0]}: is for a comparison; give --reference MAP.yaml")
+            raise StereovoxError(f"--exclude {self.exclude[0]}: is for comparisons; give --reference MAP.yaml")
 
 
 def region_of(text: str) -> tuple[float, float, float, float]:
@@ -185,7 +185,7 @@ def region_of(text: str) -> tuple[float, float, float, float]:
 
 
 def with_parameters(options: Options, given: Mapping[str, Any]) -> Options:
-    """Return options overridden by parameters of the node, given by their names without `ros.`.
+    """Return options overridden by parameters of the node, by their names without `ros.`.
 
     Raises StereovoxError, one line, for an unknown name or a value of the wrong type.
     """
@@ -209,7 +209,7 @@ def _as_kind(name: str, value: Any, default: Any) -> Any:
 
 
 def split_pair(text: str) -> tuple[str, str]:
-    """Split `TOPIC=OTHER` into both sides; the second is "" if missing."""
+    """Split `TOPIC=OTHER` into both sides; a missing second one is ""."""
     first, _, second = text.partition("=")
     return first.strip(), second.strip()
 
@@ -222,7 +222,7 @@ class Given(NamedTuple):
 
 
 def given_parameters(node: Any) -> Given:
-    """Return the parameters a node was started with."""
+    """Return the parameters with which a node was started."""
     found = Given({}, {})
     for name, parameter in node.get_parameters_by_prefix("").items():
         value = list(parameter.value) if isinstance(parameter.value, array) else parameter.value
@@ -234,7 +234,7 @@ def given_parameters(node: Any) -> Given:
 
 
 def freeze(node: Any, out: str) -> Callable[[], None]:
-    """Declare `ros.out` and refuse changes of all other parameters, until what is returned is called."""
+    """Declare `ros.out` and refuse changes of all other parameters, until the returned function is called."""
     from rcl_interfaces.msg import SetParametersResult
 
     if not node.has_parameter(OUT):
@@ -242,7 +242,7 @@ def freeze(node: Any, out: str) -> Callable[[], None]:
 
     def check(parameters: list[Any]) -> Any:
         fixed = [one.name for one in parameters if one.name != OUT and not one.name.startswith(ROS_PARAMETERS)]
-        reason = f"{', '.join(fixed)}: read at the start only; start the node anew" if fixed else ""
+        reason = f"{', '.join(fixed)}: read only at the start; restart the node" if fixed else ""
         return SetParametersResult(successful=not fixed, reason=reason)
 
     node.add_on_set_parameters_callback(check)

@@ -31,7 +31,7 @@ UNHEARD_S = 1.0
 """Seconds between 2-D maps without a subscriber: a late subscriber gets one at most this old."""
 DIAGNOSED_S = 1.0
 MAP, CLOUD, BINARY, FULL = "map_mapping", "occupied_cells", "octomap_binary", "octomap_full"
-"""Topics; those of the OctoMap have the names of octomap_server."""
+"""Topics; the OctoMap ones have the names of octomap_server."""
 
 
 def time_of(stamp_ns: int) -> Any:
@@ -120,9 +120,9 @@ def _format_value(value: object) -> str:
 
 
 class Outputs:
-    """Publishes a map that frames have changed while it is not stale or lost, and once it was corrected, or at the end.
+    """Publishes a map that frames have changed, unless it is stale or lost; also after a correction, and at the end.
 
-    Each message has the stamp of the map's newest frame; diagnostics always say how old that is.
+    Each message has the stamp of the map's newest frame; diagnostics always give its age.
 
     counts: returns the values of diagnostics besides health. clock: monotonic seconds."""
 
@@ -149,9 +149,9 @@ class Outputs:
         self._new_map = self._new_cloud = True
 
     def renewed(self, stamp_ns: int, frame_id: str) -> Any:
-        """Publish the map that has replaced another, so that nobody who comes later gets the old one; return it in 2-D.
+        """Publish a map that has replaced another, so that no later subscriber gets the old one; return it in 2-D.
 
-        A map without a known cell is one unknown cell: a `nav_msgs/OccupancyGrid` without cells clears nobody's copy.
+        A map without a known cell is sent as one unknown cell: an empty `nav_msgs/OccupancyGrid` clears nobody's copy.
         """
         self.changed(stamp_ns, frame_id)
         grid = self._grid() or OccupancyGrid(np.full((1, 1), -1, np.int8), self._mapping.config.voxel_size)
@@ -163,7 +163,7 @@ class Outputs:
         return message
 
     def corrected(self) -> None:
-        """Mark the map as changed by other means than a frame; its newest frame is the same."""
+        """Mark the map as changed by a correction; its newest frame stays the same."""
         self._new_map = self._new_cloud = self._corrected = True
 
     def update(self) -> None:
@@ -192,7 +192,7 @@ class Outputs:
         """Return whether the map is fresh enough to be published, else log why not."""
         health = self._mapping.health()
         if health.state in STALE:
-            text = f"the map is not published, it is {health.text}"
+            text = f"the map is not published, since it is {health.text}"
             self._node.get_logger().error(text, throttle_duration_sec=10.0)
         return health.state not in STALE
 
@@ -200,13 +200,13 @@ class Outputs:
         self._new_map = self._corrected = False
         heard = self._publishers.map.get_subscription_count() > 0
         period = 1 / self._options.map_rate if heard else UNHEARD_S
-        self._next_map = max(self._next_map, now - period) + period  # one frame may come early: camera rates vary
+        self._next_map = max(self._next_map, now - period) + period  # one frame may be early: camera rates vary
         grid = self._grid()
         if grid is not None:
             self._publishers.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
 
     def _grid(self) -> OccupancyGrid | None:
-        """Return the 2-D map; None if nothing is known, or if it cannot be made, which is logged."""
+        """Return the 2-D map; None if nothing is known, or, after logging it, if it cannot be made."""
         try:
             return self._mapping.grid()
         except StereovoxError as error:
@@ -253,7 +253,7 @@ class _Publishers:
             self._cloud = node.create_publisher(PointCloud2, CLOUD, latched_qos())
             octomap = optional_message("octomap_msgs", "Octomap")
             if octomap is None:
-                node.get_logger().info("octomap_msgs is not installed: no OctoMap is published")
+                node.get_logger().info("octomap_msgs is not installed, so no OctoMap is published")
             else:
                 self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, latched_qos())
 
@@ -262,7 +262,7 @@ class _Publishers:
         return any(one is not None and one.get_subscription_count() > 0 for one in (self._cloud, self._octomap))
 
     def send(self, voxel_map: VoxelMap, stamp_ns: int, frame_id: str, to_nobody: bool = False) -> None:
-        """Publish the cloud and the OctoMap if they have subscribers; to_nobody: also if not, for later ones."""
+        """Publish the cloud and the OctoMap if they have subscribers; to_nobody: even without, for later ones."""
         if self._cloud is not None and (to_nobody or self._cloud.get_subscription_count()):
             self._cloud.publish(cloud_message(voxel_map, stamp_ns, frame_id))
         if self._octomap is not None and (to_nobody or self._octomap.get_subscription_count()):
@@ -270,7 +270,7 @@ class _Publishers:
 
 
 def latched_qos() -> Any:
-    """Return the quality of service of maps: reliable, and the last one is kept for late subscribers."""
+    """Return the quality of service of maps: reliable, with the last one kept for late subscribers."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

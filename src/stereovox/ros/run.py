@@ -29,15 +29,15 @@ from stereovox.runs.pose_choice import NOT_COMPARED, TRACK, uncompared
 from stereovox.runs.warm_up import warm_up
 
 MAX_REPORTS = 10_000
-"""Number of last frames whose times are summarised at the end."""
+"""Most recent frames whose times are summarised at the end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeOptions(MapOptions):
-    """Options of a `NodeRun`, in addition to those of `MapOptions`.
+    """Options of a `NodeRun`, in addition to `MapOptions`.
 
     Attributes:
-        load: Map to continue; "": none.
+        load: Map to continue; "" for none.
         report: Called at the end, before the map is saved, with the figures and the reports of the last frames.
     """
 
@@ -47,16 +47,16 @@ class NodeOptions(MapOptions):
 
 
 class NodeRun(Run[None, dict[str, Any]]):
-    """Maps live topics until a signal; then it maps what waits, saves the map, and returns figures for the report.
+    """Maps live topics until a signal; then it maps waiting frames, saves the map, and returns figures for the report.
 
     Args:
-        node: rclpy's, or what stands for it (`Entities`).
+        node: rclpy's, or its stand-in (`Entities`).
         config: All settings of the map.
-        topics: Options of the node: topics, frames, times, and where the map is saved.
-        options: Those of every run.
+        topics: Options of the node: topics, frames, times, and where to save the map.
+        options: Options of the run.
 
     Attributes:
-        map_node: What makes the map, once entered.
+        map_node: The node that makes the map, once entered.
 
     Raises:
         StereovoxError: On entering: invalid options, or another run writes there.
@@ -74,7 +74,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         config, topics, load = self._config, self._topics, self._options.load
         if config.dimensions == 2 and topics.localised and not load:
             trusting = uncompared(config)
-            why = "SLAM and localisation correct the robot's pose by more than a cell at times"
+            why = "SLAM and localisation may correct the robot's pose by more than a cell"
             if trusting is not config:
                 self._node.get_logger().info(NOT_COMPARED.format(why=why))
             config = trusting
@@ -100,7 +100,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         self._go(None)
 
     def end(self) -> dict[str, Any]:
-        """Map what waits, save the map, release everything; return figures for the report."""
+        """Map waiting frames, save the map, release everything; return figures for the report."""
         with self._open:
             return self._end()
 
@@ -130,15 +130,15 @@ class NodeRun(Run[None, dict[str, Any]]):
             if self._save(few):
                 result["out"] = self._out()
             elif self._out():
-                self._notify("no frame could be used: no map is written")
-        finally:  # SLAM's map is kept if the other one cannot be
+                self._notify("no frame could be used, so no map is written")
+        finally:  # SLAM's map is kept even if the other one cannot be
             if grid is not None and self._topics.slam_out:
                 write_map_server(grid, self._topics.slam_out)
                 self._notify(f"SLAM's map is saved in {self._topics.slam_out}")
         return result
 
     def _or_saved(self, act: Callable[[], Any]) -> Any:
-        """Do something; whatever fails, the map so far is saved."""
+        """Call `act`; if it fails, save the map so far."""
         try:
             return act()
         except Exception:
@@ -146,7 +146,7 @@ class NodeRun(Run[None, dict[str, Any]]):
             raise
 
     def _save(self, few: str = "") -> bool:
-        """Save the map if it holds a frame and is wanted; return whether it was saved. few: what is said of it."""
+        """Save the map if it holds a frame and `ros.out` is set; return whether it was saved. few: a remark on it."""
         if not (self._out() and self._kept):
             return False
         self._mapping.save(self._out())
@@ -154,7 +154,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         return True
 
     def _out(self) -> str:
-        """Return where the map is saved now: a parameter that may change; "": nowhere."""
+        """Return where to save the map, by a parameter that may change; "": nowhere."""
         return str(self._node.get_parameter(OUT).value)
 
     def _figures(self) -> dict[str, Any]:

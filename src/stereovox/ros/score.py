@@ -19,17 +19,17 @@ from stereovox.ros.options import Options, region_of
 
 TOPIC = "map_error"
 PERIOD_S = 1.0
-"""Seconds between two scores at least."""
+"""Least seconds between two scores."""
 
 
 def error_of(grid: OccupancyGrid, reference: OccupancyGrid, exclude: Sequence[Rectangle]) -> CellErrors:
-    """Return how a map differs from a reference in the same frame; raises StereovoxError as `score_grids`."""
+    """Return the differences of a map from a reference in the same frame; raises StereovoxError as `score_grids`."""
     laid = laid_on(grid, reference, exclude, align=False)
     return cell_errors(laid, differences(laid))
 
 
 def score_of(node: Any, mapping: Mapping, options: Options) -> Score | None:
-    """Return what compares the map with the reference in the options, None without one; raises StereovoxError."""
+    """Return the comparison of the map with the options' reference, None without one; raises StereovoxError."""
     file = options.reference or options.floor
     return Score(node, mapping, read_map_server(file), [region_of(text) for text in options.exclude]) if file else None
 
@@ -55,7 +55,7 @@ class Score:
         return {} if self._last is None else self._values(self._last)
 
     def update(self) -> None:
-        """Publish a score that is ready, and begin the next one if it is due."""
+        """Publish a finished score, and begin the next one if it is due."""
         if (ended := self._work.poll()) is not None:
             self._busy = False
             self._take(ended.result)
@@ -67,7 +67,7 @@ class Score:
             self._work.put(partial(error_of, grid, self._reference, self._exclude))
 
     def final(self) -> dict[str, object]:
-        """Score the map as it is, and return Eq 7 and its parts in per cent; empty if there is no map."""
+        """Score the present map, and return Eq 7 and its parts in per cent; empty without a map."""
         self._work.drop()
         self._busy = False
         if (grid := self._grid()) is not None:
@@ -76,7 +76,7 @@ class Score:
 
     def _grid(self) -> OccupancyGrid | None:
         try:
-            return self._mapping.grid()  # a copy: the map may go on
+            return self._mapping.grid()  # a copy, since the map may change
         except StereovoxError as error:
             self._node.get_logger().warning(f"no score: {error}", throttle_duration_sec=30.0)
             return None

@@ -12,18 +12,16 @@ from stereovox.ros.mapping import Mapping
 
 
 def check_continuable(path: str, continuable: bool) -> None:
-    """Raise StereovoxError if a map cannot be continued because each run has a frame of its own."""
+    """Raise StereovoxError if a map cannot be continued because each run has its own frame."""
     if not continuable:
-        raise StereovoxError(
-            f"{path}: a tracked camera, or SLAM, does not know where it is in an older map; begin a new one"
-        )
+        raise StereovoxError(f"{path}: a tracked camera, or SLAM, cannot be located in an older map; begin a new one")
 
 
 class Services:
     """`~/save` and `~/reset` (std_srvs/Trigger), `~/load` (nav_msgs/LoadMap).
 
     out: returns where to save, "": nowhere. renewed: called after another map has replaced the current one; returns it
-    as a `nav_msgs/OccupancyGrid`. continuable: whether saved maps can be continued with the poses that there are. They
+    as a `nav_msgs/OccupancyGrid`. continuable: whether saved maps can be continued with the source of poses. Services
     run between two frames.
     """
 
@@ -64,7 +62,7 @@ class Services:
 
     def _load(self, request: Any, response: Any) -> Any:
         path = request.map_url.removeprefix("file://")
-        if not os.path.exists(path):  # false, where Path raises, for names that no file can have
+        if not os.path.exists(path):  # False for impossible names, for which Path raises
             self._log.error(f"{path}: no such map; check the name")
             response.result = response.RESULT_MAP_DOES_NOT_EXIST
             return response
@@ -76,7 +74,7 @@ class Services:
             response.result = response.RESULT_INVALID_MAP_DATA
             return response
         response.map = self._renewed()
-        self._log.info(f"going on with {path}")
+        self._log.info(f"continuing {path}")
         response.result = response.RESULT_SUCCESS
         return response
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions of the node. Messages stay bytes: the bag readers parse them, and nothing is parsed twice.
+"""Subscriptions of the node. Messages stay bytes, which the bag readers parse; nothing is parsed twice.
 
-Where the quality of service of a publisher does not match, rclpy logs "offering incompatible QoS".
+If the quality of service of a publisher does not match, rclpy logs "offering incompatible QoS".
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from stereovox.runs.pose_choice import TRACK
 FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""
 TF2_MSGS = "Source a ROS 2 distribution (source /opt/ros/jazzy/setup.bash) or build it (docs/ros2.md)"
-"""Where `tf2_msgs` comes from: it is not on PyPI."""
+"""How to get `tf2_msgs`: it is not on PyPI."""
 LONGEST_NS = 10_000_000_000
-"""A message that lay in the middleware for longer has no time of reception that can be used."""
+"""A message that waited in the middleware for longer has no usable time of reception."""
 POSE_QUEUE = 100
 """Length of the middleware's queues for pose messages."""
 
 
 class Silence:
-    """Warns about topics without any message so far. received: number of messages by topic."""
+    """Warns about topics without a message so far. received: number of messages by topic."""
 
     def __init__(
         self,
@@ -51,11 +51,11 @@ class Silence:
         self._next = now + AGAIN_S
         for topic, one in self._inputs.items():
             if not self._received.get(topic):
-                self._node.get_logger().warning(f"nothing has come on {topic}: {self._why(topic, one.kind)}")
+                self._node.get_logger().warning(f"no message on {topic}: {self._why(topic, one.kind)}")
 
     def _why(self, topic: str, kind: str) -> str:
         if self._node.count_publishers(topic):
-            return "it is published, but no message gets here; see docs/ros2.md: large images need room"
+            return "it is published, but no message arrives; see docs/ros2.md: large images need larger buffers"
         type_name = kind.replace("/", "/msg/")
         others = sorted(
             name
@@ -63,17 +63,17 @@ class Silence:
             if type_name in types and self._node.count_publishers(name)
         )
         if others:
-            return f"nobody publishes it; {kind} is on {', '.join(others)}"
-        return f"nobody publishes it, nor {kind} on any other topic; does the camera run, with the same ROS_DOMAIN_ID?"
+            return f"nobody publishes it, but {kind} is on {', '.join(others)}"
+        return f"nobody publishes it, nor {kind} on any topic; is the camera running, with the same ROS_DOMAIN_ID?"
 
 
 class Subscriptions:
     """Subscribes to all topics in the options, and to /tf and /tf_static.
 
-    arrived: called with topic and bytes of a message to map. on_path: called with those of a corrected path.
+    arrived: called with topic and bytes of a message to map. on_path: called with the bytes of a corrected path.
     messages: number of messages received, of all kinds. arrived_ns: when the last one arrived, monotonic.
-    Raises StereovoxError, one line, for an invalid topic name, and if nothing can give a pose: no /tf, for want of
-    `tf2_msgs`, and no other source of poses in the options.
+    Raises StereovoxError, one line, for an invalid topic name, and if nothing can give a pose: no /tf, since `tf2_msgs`
+    is missing, and no other source of poses in the options.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Subscriptions:
             )
         if kind is None:
             others = "mounts come from ros.fixed" if tracked else "poses come from ros.odometry, ros.pose and ros.fixed"
-            self._node.get_logger().warning(f"tf2_msgs is not installed: /tf is not heard, {others} alone. {TF2_MSGS}")
+            self._node.get_logger().warning(f"tf2_msgs is not installed, so /tf is ignored: {others} alone. {TF2_MSGS}")
             return
         moving, fixed = partial(where.on_tf, fixed=False), partial(where.on_tf, fixed=True)
         self._subscribe(kind, "/tf", moving, _qos(POSE_QUEUE, reliable=True))
@@ -134,7 +134,7 @@ class Subscriptions:
 
 
 def arrived(info: Mapping[str, int]) -> int:
-    """Return when a message was received, monotonic nanoseconds, by what rclpy says of it; now if it does not."""
+    """Return when a message was received, in monotonic nanoseconds, by rclpy's record; now without one."""
     waited_ns = epoch_ns() - info.get("received_timestamp", 0)
     return monotonic_ns() - (waited_ns if 0 <= waited_ns <= LONGEST_NS else 0)
 

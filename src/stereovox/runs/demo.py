@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Demo: a simulated camera flies through the built-in room; map, picture and report are made and checked."""
+"""Demo: fly a simulated camera through the built-in room, then make and check map, picture and report."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from stereovox.view.report.demo import write_report
 from stereovox.view.report.folder import out_folder
 
 MIN_FRAMES = 20
-"""A cell must stand in the map once so many frames saw it."""
+"""A cell must be in the map once this many frames saw it."""
 
 BATCH = 16
 """Frames simulated at a time: some 50 MB."""
 
 Progress = Callable[[int, int, str], None]
-"""Called with steps done, steps in all, and what is being done."""
+"""Called with steps done, steps in all, and the current step in words."""
 
 
 def demo(
@@ -44,22 +44,22 @@ def demo(
 ) -> dict[str, Any]:
     """Run the whole flow on the built-in scene and write `room.svox`, `room.png` and `report.html` into folder `out`.
 
-    A part of the scene must stand in the map once `min_frames` frames saw it.
+    A part of the scene must be in the map once `min_frames` frames saw it.
     Returns a summary fit for JSON: the keys of `map --json`, and `accuracy`, `parts`, `missing`, `files`, `seconds`.
-    Raises StereovoxError when the folder cannot be written.
+    Raises StereovoxError if the folder cannot be written.
     """
     start = perf_counter()
     folder = out_folder(out)
     source = source or Simulation()
-    tell = progress or (lambda done, total, text: None)
+    show = progress or (lambda done, total, text: None)
     truth = exact_occupancy(source.scene, voxel_size)
     files = {"map": folder / "room.svox", "picture": folder / "room.png", "report": folder / "report.html"}
     flight = _Flight(source)
     with MapRun(flight, files["map"], voxel_size=voxel_size) as run:
-        watch = _Watch(flight, Sightings(truth.surface, voxel_size), run.mapper.config.max_range, tell)
+        watch = _Watch(flight, Sightings(truth.surface, voxel_size), run.mapper.config.max_range, show)
         made = run.finish([watch])
     mapped = perf_counter()
-    tell(len(source), len(source), "checking the map and drawing it")
+    show(len(source), len(source), "checking and drawing the map")
     summary = {**_facts(source, made), **_quality(made.map, truth, watch.sightings.frames, min_frames)}
     picture(made.map, files["picture"], title=f"stereovox demo: {source.name}")
     write_report(files["report"], summary, files["picture"])
@@ -69,7 +69,7 @@ def demo(
 
 
 class _Flight(Stream):
-    """A simulated recording. depth: the exact depth of the last frame that it gave."""
+    """A simulated recording. depth: the exact depth of the last frame that it yielded."""
 
     depth: NDArray[np.float32]
 
@@ -96,17 +96,17 @@ class _Flight(Stream):
 
 
 class _Watch:
-    """Notes which cells each frame of a flight saw, and tells of the progress."""
+    """Records which cells each frame of a flight saw, and reports progress."""
 
-    def __init__(self, flight: _Flight, sightings: Sightings, max_range: float, tell: Progress):
+    def __init__(self, flight: _Flight, sightings: Sightings, max_range: float, show: Progress):
         self.sightings = sightings
-        self._flight, self._max_range, self._tell, self._done = flight, max_range, tell, 0
+        self._flight, self._max_range, self._show, self._done = flight, max_range, show, 0
 
     def after(self, frame: Frame, report: UpdateReport) -> None:
-        """Note a frame that was offered to the map."""
+        """Record a frame that was offered to the map."""
         self.sightings.add(self._flight.depth, self._flight.camera, frame.T_world_sensor, self._max_range)
         self._done += 1
-        self._tell(self._done, self._flight.length, "flying and mapping")
+        self._show(self._done, self._flight.length, "flying and mapping")
 
 
 def _facts(source: Simulation, made: MapResult[VoxelMap]) -> dict[str, Any]:

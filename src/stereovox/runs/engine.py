@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How any run goes: that of a recording, a floor, a trajectory, cameras that are running, or the ROS node.
+"""The engine of all runs: over a recording, a floor, a trajectory, live cameras, or the ROS node.
 
     with MapRun(source, out, **options) as run:   # opens and checks everything; nobody else may write to `out` now
-        result = run.finish(observers)            # step by step, then saves and says what became of it
+        result = run.finish(observers)            # step by step, then saves and returns the result
 
 A step maps one frame, calls the observers, and saves the map if that is due (`Checkpoints`). A signal ends the run
-after a step, and a source that fails ends it, once the map is saved. Each kind of run says what its steps are, what one
-of them does, and what becomes of it all: `recording.py`, `floor.py`, `trajectory.py`, `live/run.py`, `ros/run.py`.
+after a step; a source that fails also ends it. Both times the map is saved first. Each kind of run defines its steps
+and its result: `recording.py`, `floor.py`, `trajectory.py`, `live/run.py`, `ros/run.py`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from stereovox.maps.grid_map import GridMap
 
 CHECKPOINT_S = 10.0
 REST = 25
-"""Minimum pause between two saves, in durations of a save: saves take at most 4 % of a run."""
+"""Least pause between two saves, in durations of a save: saves take at most 4 % of a run."""
 SURVEYED = 10
-"""Frames of a recording that are read before it is used, for the settings that it suggests."""
+"""Frames of a recording that are read in advance, to suggest settings."""
 
 AnyCallable = TypeVar("AnyCallable", bound=Callable[..., Any])
 MapT = TypeVar("MapT", VoxelMap, GridMap)
@@ -45,7 +45,7 @@ StepT = TypeVar("StepT")
 
 
 def silent(line: str) -> None:
-    """Drop a line that nobody wants to read."""
+    """Discard a line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,9 @@ class RunOptions:
     """Options of every run.
 
     Attributes:
-        profile: Profile name, TOML file or Config; None: `default`, or those of the map to continue.
-        notify: Called with each line that a user should see: what is assumed about the source, where a run resumes.
-        settings: Settings by name, as for `Mapper`; as keyword arguments they stand among the options.
+        profile: Profile name, TOML file or Config; None: `default`, or that of the map to continue.
+        notify: Called with each line that a user should see: assumptions about the source, the frame to resume at.
+        settings: Settings by name, as for `Mapper`; given as keyword arguments among the options.
     """
 
     profile: str | Path | Config | None = None
@@ -76,7 +76,7 @@ class RunOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions(RunOptions):
-    """Options of every run that makes a map, in addition to those of `RunOptions`.
+    """Options of every run that makes a map, in addition to `RunOptions`.
 
     Attributes:
         checkpoint_s: Seconds between two saves; 0: save only at the end.
@@ -86,9 +86,9 @@ class MapOptions(RunOptions):
 
 
 def takes(*kinds: Callable[..., Any]) -> Callable[[AnyCallable], AnyCallable]:
-    """Show the keyword arguments of `kinds` in the signature of a function that passes `**options` on to them.
+    """Add the keyword arguments of `kinds` to the signature of a function that passes `**options` on to them.
 
-    `help` and notebooks print it.
+    `help` and notebooks show it.
     """
 
     def shown(function: AnyCallable) -> AnyCallable:
@@ -110,18 +110,18 @@ class Observer(Protocol):
 
         Args:
             frame: The `Frame`, `StereoFrame` or `Scan` that was offered.
-            report: What `add` of the mapper returned for it.
+            report: The report of the mapper's `add`.
         """
         ...
 
 
 @dataclass(frozen=True)
 class RunResult(Generic[MapT]):
-    """What every run that makes a map returns.
+    """The result of every run that makes a map.
 
     Attributes:
         map: The map, as saved.
-        out: Where it was saved.
+        out: The path it was saved to.
         reports: One report for each frame of this run, in order.
     """
 
@@ -130,11 +130,11 @@ class RunResult(Generic[MapT]):
     reports: list[UpdateReport]
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the map's picture and facts."""
+        """Return the map's picture and facts, for notebooks."""
         return self.map._repr_html_(f"{type(self).__name__}, saved in {self.out}")
 
     def _summary(self, came: int, what: str, doubts: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """Summarise the run, with the doubt that most of the `what` (frames) that came are not in the map."""
+        """Summarise the run, with a doubt if most of the `what` (frames) that arrived are not in the map."""
         found = summarise(self.map, self.reports)
         if all_doubts := [*doubts, *mostly_lost(found["frames"], came, what)]:
             found["doubts"] = all_doubts
@@ -145,11 +145,11 @@ class Run(ABC, Generic[StepT, ResultT]):
     """One run in two steps: entering opens and checks everything, `finish` does the work.
 
     Attributes:
-        stopped: Whether a signal ended it where that is the usual end.
+        stopped: Whether a signal ended it, if that is the usual end.
     """
 
     usual_end: tuple[type[BaseException], ...] = ()
-    """What ends the run as usual: a signal, where the steps never end by themselves."""
+    """Exceptions that end the run normally: a signal, if the steps never end by themselves."""
     _checkpoints: Checkpoints
 
     def __init__(self, notify: Callable[[str], None] = silent):
@@ -159,7 +159,7 @@ class Run(ABC, Generic[StepT, ResultT]):
         self.stopped = False
 
     def __enter__(self) -> Self:
-        with ExitStack() as stack:  # what fails leaves nothing open
+        with ExitStack() as stack:  # a failure leaves nothing open
             self._begin(stack)
             self._open = stack.pop_all()
         return self
@@ -168,13 +168,13 @@ class Run(ABC, Generic[StepT, ResultT]):
         self._open.close()
 
     def finish(self, observers: Sequence[Observer] = ()) -> ResultT:
-        """Take all steps, and save what they made.
+        """Take all steps, and save the result.
 
         Args:
             observers: Called after each frame.
 
         Returns:
-            What became of the run.
+            The result of the run.
 
         Raises:
             StereovoxError: The source failed, the disk is full, or not one frame could be used.
@@ -194,10 +194,10 @@ class Run(ABC, Generic[StepT, ResultT]):
                     self._checkpoints.save(self._kept)
                     self._notify(self._stopped_line())
                 raise
-            return self._end()  # a second signal, as `timeout` sends it, does not cut the saving
+            return self._end()  # a second signal, as `timeout` sends it, does not interrupt the save
 
     def _go(self, step: StepT) -> None:
-        """Take one step; then a signal may end the run, and the map is saved if that is due."""
+        """Take one step; then a signal may end the run, or the map is saved if that is due."""
         self._take(step)
         self._check()
         self._save_if_due()
@@ -211,15 +211,15 @@ class Run(ABC, Generic[StepT, ResultT]):
         """Open and check everything, make `_checkpoints`; `stack` is closed when the run ends, or cannot begin."""
 
     def _prepare_steps(self) -> None:
-        """Do what a signal may cut short."""
+        """Do the work before the steps, which a signal may cut short."""
 
     def _around(self) -> AbstractContextManager[Any]:
-        """Return what lasts from before the first step until all is saved."""
+        """Return a context that lasts from before the first step until all is saved."""
         return nullcontext()
 
     @abstractmethod
     def _steps(self) -> Iterable[StepT]:
-        """Return what is done one after the other."""
+        """Return the steps, in order."""
 
     @abstractmethod
     def _take(self, step: StepT) -> None:
@@ -227,16 +227,16 @@ class Run(ABC, Generic[StepT, ResultT]):
 
     @property
     def _kept(self) -> int:
-        """Number of frames that a save would hold; 0: there is nothing to save."""
+        """Number of frames that a save would hold; 0 if there is nothing to save."""
         return 0
 
     def _stopped_line(self) -> str:
-        """Return what the user reads about a run that was stopped, once it is saved."""
+        """Return the line that reports a stopped run, once it is saved."""
         return ""
 
     @abstractmethod
     def _end(self) -> ResultT:
-        """Save what was made, and return what became of it; raises StereovoxError if that is nothing."""
+        """Save and return the result; raises StereovoxError if there is none."""
 
 
 class MapperRun(Run[StepT, ResultT]):
@@ -247,7 +247,7 @@ class MapperRun(Run[StepT, ResultT]):
         reports: The report of each frame so far.
     """
 
-    mapper: Any  # a `Mapper` or a `GridMapper`, as the kind of run says
+    mapper: Any  # a `Mapper` or a `GridMapper`, by the kind of run
 
     def __init__(self, notify: Callable[[str], None] = silent):
         super().__init__(notify)
@@ -256,7 +256,7 @@ class MapperRun(Run[StepT, ResultT]):
     def _take(self, step: StepT) -> None:
         try:
             report = self.mapper.add(step)
-        except MapFileError as error:  # no room for a tile; up to this frame the map is whole in memory
+        except MapFileError as error:  # no room for a tile; in memory, the map is whole up to this frame
             self._checkpoints.save(frames_offered(self.mapper))
             raise MapFileError(f"{error}; {self._checkpoints.saved_so_far()}") from None
         self.reports.append(report)
@@ -265,11 +265,11 @@ class MapperRun(Run[StepT, ResultT]):
 
     @property
     def _kept(self) -> int:
-        """Number of frames in the map; 0 while all were refused: it must not take the place of an older map."""
+        """Number of frames offered to the map; 0 while all were refused: it must not replace an older map."""
         return frames_offered(self.mapper) if self.mapper.map.frames else 0
 
     def _first_refusal(self) -> str:
-        """Return why the first of the refused frames was refused; "": none was."""
+        """Return why the first refused frame was refused, "" if all were accepted."""
         return next((report.detail for report in self.reports if report.refused), "")
 
 
@@ -281,7 +281,7 @@ def frames_offered(mapper: AnyMapper[Any]) -> int:
 class Checkpoints:
     """Saves a map between frames when a checkpoint is due.
 
-    save: writes the map atomically. out: its path, for messages. seconds: between two saves; 0: none before the end.
+    save: writes the map atomically. out: its path, for messages. seconds: between two saves; 0: save only at the end.
     clock: returns seconds. Raises StereovoxError for negative or infinite seconds.
     """
 
@@ -294,7 +294,7 @@ class Checkpoints:
         self._saved = 0
 
     def after(self, frames: int) -> None:
-        """Save if a checkpoint is due. frames: number of frames in the map."""
+        """Save if a checkpoint is due. frames: number of frames offered so far."""
         start = self._clock()
         if start >= self._due:
             self.save(frames)
@@ -320,8 +320,8 @@ class Checkpoints:
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
     """Defer signals: yield a function that raises KeyboardInterrupt if one has arrived, so that no step is cut in half.
 
-    Handles Ctrl-C (a second one acts at once), SIGTERM (`kill`, systemd, docker stop) and SIGHUP (the terminal is
-    gone), which may arrive several times: `timeout` sends two. The exception holds the signal's number.
+    Handles Ctrl-C (a second one acts at once), SIGTERM (`kill`, systemd, docker stop) and SIGHUP (the terminal
+    closed), which may arrive several times: `timeout` sends two. The exception holds the signal's number.
     """
     received: list[int] = []
 
@@ -342,9 +342,9 @@ def interrupt_between_steps() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def ended_in_order() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end what runs as Ctrl-C does: the first raises KeyboardInterrupt, which holds its number.
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does: the first raises KeyboardInterrupt, which holds its number.
 
-    What cleans up after that is not disturbed by those that follow, nor by another Ctrl-C.
+    Later signals, or another Ctrl-C, do not disturb the cleanup.
     """
     before = {number: signal.getsignal(number) for number in _default_signals()}
 
@@ -365,7 +365,7 @@ def ended_in_order() -> Iterator[None]:
 def _default_signals() -> list[int]:
     """Return the signals with default handling: notebooks, servers, nohup and background jobs set their own.
 
-    None in a thread other than the main one, which alone may handle signals.
+    Empty outside the main thread, which alone may handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         return []

@@ -2,7 +2,7 @@
 """Map a ground robot's recording to a 2-D floor map on disk, as `recording.py` does for 3-D maps.
 
 The Python side of `stereovox grid`: `map_floor` does it in one call, `FloorRun` in steps. However the run ends, the
-files hold all readings up to the last checkpoint. They do not record which readings: `resume` continues with the saved
+files hold all readings up to the last checkpoint, but do not record which ones: `resume` continues with the saved
 cells and adds the readings it is given.
 """
 
@@ -40,14 +40,14 @@ SLAM, ODOMETRY = "slam", "odometry"
 
 @dataclass(frozen=True, kw_only=True)
 class FloorOptions(MapOptions):
-    """Options of `map_floor`, in addition to those of `MapOptions`.
+    """Options of `map_floor`, in addition to `MapOptions`.
 
     Attributes:
         poses: Source of the robot's poses: `"slam"`, `"odometry"`, or the `.yaml` of a map to localise the robot in.
-            None: with a lidar, the map to resume, else SLAM; without one, odometry.
+            None: with a lidar, the map to resume or SLAM; without one, odometry.
         use: What to map: `"depth"`, `"lidar"` or `"both"`; None: depth images if there are any, else lidar.
         frames: Python slice that selects readings: `"::4"`.
-        start: The robot's first pose in the map it is localised in: x, y in metres and yaw in radians; None: unknown.
+        start: The robot's first pose in the map of `poses`: x, y in metres and yaw in radians; None: unknown.
         mode: How the files store probabilities: `"trinary"`, `"scale"` or `"raw"` (see `write_map_server`).
         resume: Continue with the cells of the map at `out` (True), or of the map whose `.yaml` this is. All readings
             that `frames` selects are added: the files do not record which ones the map already holds.
@@ -71,7 +71,7 @@ def map_floor(
         source: As for `open_robot` (a bag, a CARMEN log, `sim:floor`), or a `Robot` of your own.
         out: The `.yaml`, `.pgm` or `.png` to write. An older map there stays whole until the first save.
         observers: Called after each reading.
-        **options: Those of `FloorOptions`, and settings by name, as for `GridMapper`.
+        **options: Fields of `FloorOptions`, and settings by name, as for `GridMapper`.
 
     Returns:
         The map, the robot's trajectory in it, and the report of each reading.
@@ -126,7 +126,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         if mode == "scale" and self.out.suffix.lower() == ".pgm":
             raise StereovoxError(f"{self.out}: mode scale has no grey for unknown cells; name a .yaml or .png")
         if self._resumed == self.out and not self.out.exists():
-            raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
+            raise StereovoxError(f"{self.out}: no map to continue; start without resume")
         stack.enter_context(only_writer_of_floor(self.out))
         self.config = load_config(self._options.profile or "default", **self._options.settings)
         self.robot = self._open_robot()
@@ -142,7 +142,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
             progress: Called with the number of scans done, their total, and the current step in words.
 
         Returns:
-            The trajectory in the map; None: the odometry's poses are used.
+            The trajectory in the map; None if the poses are odometry's.
 
         Raises:
             StereovoxError: SLAM or localisation failed.
@@ -159,13 +159,13 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         return (track.corrected(one) if track else one for one in self._readings)
 
     def _stopped_line(self) -> str:
-        saved = f"they are saved in {self.out.with_suffix('.yaml')}"
+        saved = f"saved in {self.out.with_suffix('.yaml')}"
         return f"stopped after {len(self.reports)} of {self.remaining} readings; {saved}"
 
     def _end(self) -> MapResult[GridMap]:
         if not self.mapper.map.frames:
             why = self._first_refusal() or "the source is empty"
-            raise StereovoxError(f"not one reading could be used, no map is written ({why})")
+            raise StereovoxError(f"not one reading could be used, so no map is written ({why})")
         self._checkpoints.save(self._kept)
         return MapResult(self.mapper.map, self.out, self.reports, track=self._track, doubts=self._doubts)
 
@@ -176,7 +176,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         return robot
 
     def _select_readings(self) -> tuple[Iterator[Scan | Frame], int]:
-        """Return the readings to map, in order of time, and their number."""
+        """Return the readings to map, in time order, and their number."""
         robot = self.robot
         use = self._options.use or ("depth" if len(robot.frames) else "lidar")
         frames = self._options.frames
@@ -195,18 +195,18 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         return in_time_order(*streams), sum(map(len, picked.values()))
 
     def _pose_source(self) -> tuple[str, OccupancyGrid | None]:
-        """Return the source of poses: `slam`, `odometry`, or the file of a map and that map."""
+        """Return the source of poses: `slam`, `odometry`, or the file of a map; and that map."""
         how = None if self._options.poses is None else str(self._options.poses)
         if how == SLAM and self._resumed:
             raise StereovoxError(
-                f"{self._resumed}: SLAM makes a frame of its own; to go on, leave poses out: the robot is localised in "
-                "the map"
+                f"{self._resumed}: SLAM starts a new frame; to continue the map, leave poses out: the robot is then "
+                "localised in it"
             )
         if how is None:
             how = str(self._resumed or SLAM) if len(self.robot.scans) else ODOMETRY
         if how in (SLAM, ODOMETRY):
             if self._start is not None:
-                raise StereovoxError(f"poses {how}: start says where in a map; give the map's .yaml, or no start")
+                raise StereovoxError(f"poses {how}: start is a pose in a map; give the map's .yaml, or no start")
             return how, None
         if Path(how).suffix.lower() not in FLOOR_READABLE:
             raise StereovoxError(f"poses {how}: give slam, odometry, or the .yaml of a map to localise in")
@@ -219,7 +219,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         drifts = self._poses_from == ODOMETRY
         if drifts or (self._floor is not None and self._resumed is None):
             config, before = uncompared(self.config), self.config
-            why = "poses of odometry drift" if drifts else "poses in a map are off by more than a cell at times"
+            why = "odometry drifts" if drifts else "poses in a map may be off by more than a cell"
             self._notify_unless_empty("" if config is before else f"note: {NOT_COMPARED.format(why=why)}")
             self.config = config
         if self._resumed is None:
@@ -231,12 +231,12 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
         return GridMapper(self.config, voxel_size=size, resume=before)
 
     def _slam(self, progress: Progress) -> Track:
-        others = "others: poses (--poses) MAP.yaml to localise in a map, or odometry"
+        others = "alternatives: poses (--poses) MAP.yaml to localise in a map, or odometry"
         self._notify(f"finding the robot's trajectory by SLAM; {others}")
         try:
             found = slam_robot(self.robot, self.config, progress)
         except MissingExtra as missing:
-            raise StereovoxError(f"{missing}; or go on without SLAM: poses odometry (--poses odometry)") from None
+            raise StereovoxError(f"{missing}; or continue without SLAM: poses odometry (--poses odometry)") from None
         self._notify_unless_empty(refused_line(found.refused))
         for line in doubt_lines(found.doubts):
             self._notify(line)
@@ -256,7 +256,7 @@ class FloorRun(MapperRun[Scan | Frame, MapResult[GridMap]]):
 
 
 def _pose_of(start: ArrayLike) -> NDArray[np.float64]:
-    """Return x, y and yaw as an array. Raises StereovoxError for what is not numbers."""
+    """Return x, y and yaw as an array. Raises StereovoxError unless they are numbers."""
     try:
         return np.asarray(start, float)
     except (TypeError, ValueError):

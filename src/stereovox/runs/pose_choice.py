@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which poses a run uses: those that a recording has, or tracked ones."""
+"""Which poses a run uses: the recording's own, or tracked ones."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from stereovox.track.tracker import POSE_FAULTS
 GIVEN, TRACK, BOTH = "given", "track", "both"
 CHOICES = (GIVEN, TRACK, BOTH)
 HOW = {TRACK: "tracked", BOTH: "corrected"}
-"""How poses come about that a recording does not have, behind its name."""
-NOT_COMPARED = "scans are not compared with the map, since {why}; trust.max_disagreement=0.2 compares them"
-LOOKED_AT = 10
-"""Frames, spread over a recording, of which one must have a pose, or it has none."""
+"""Suffix of a recording's name by the poses used, unless they are its own."""
+NOT_COMPARED = "scans are not compared with the map, since {why}; set trust.max_disagreement=0.2 to compare them"
+INSPECTED = 10
+"""Frames, spread over a recording, that are inspected; if none has a pose, the recording counts as having none."""
 
 
 class Choice(NamedTuple):
-    """A source, and which poses are to be used: one of `CHOICES`; `why` it is `track`, where nobody chose that."""
+    """A source, and the poses to use: one of `CHOICES`; `why` it is `track`, if nobody chose that."""
 
     source: Stream
     poses: str
@@ -33,9 +33,9 @@ class Choice(NamedTuple):
 
 
 def uncompared(config: Config) -> Config:
-    """Return settings for scans at poses that drift, or that jump where a loop is closed: nothing is compared.
+    """Return settings for scans whose poses drift, or jump when a loop is closed: nothing is compared.
 
-    The same settings where the user has set `trust.max_disagreement`.
+    Unchanged if the user has set `trust.max_disagreement`.
     """
     if config.trust.max_disagreement != TrustConfig.model_fields["max_disagreement"].default:
         return config
@@ -43,16 +43,16 @@ def uncompared(config: Config) -> Config:
 
 
 def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | None) -> Choice:
-    """Open a source for the poses that were chosen.
+    """Open a source, and choose which poses to use.
 
     Args:
-        source: As for `open_stream`, or a stream that is open.
-        frames: Python slice that selects frames of what is opened here.
-        poses: `given`: those of the recording. `track`: from the images; those of the recording are not read. `both`:
-            those of the recording, corrected by the images. None: given where there are any, else tracked.
+        source: As for `open_stream`, or an open stream.
+        frames: Python slice that selects frames, if the source is opened here.
+        poses: `given`: the recording's own. `track`: from the images; the recording's are not read. `both`: the
+            recording's, corrected by the images. None: given if there are any, else tracked.
 
     Raises:
-        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` if there are none.
+        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` for a source without poses.
     """
     if poses not in (None, *CHOICES):
         raise StereovoxError(
@@ -74,22 +74,22 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
 
 
 def has_poses(source: Stream) -> bool:
-    """Return whether an open source has poses: one of the frames that are looked at does."""
+    """Return whether an open source has poses: whether any of the inspected frames does."""
     return not _missing(source)
 
 
 def poses_of(recording: str) -> str:
-    """Return which poses a map was made with (one of `CHOICES`), by the name of its recording."""
+    """Return the poses with which a map was made (one of `CHOICES`), by the name of its recording."""
     return next((poses for poses, how in HOW.items() if recording.endswith(f", {how}")), GIVEN)
 
 
 def _choice(source: Stream, poses: str | None) -> Choice:
-    """Return which poses of an open source are used; raises NoPoses for `both` if it has none."""
+    """Return the poses to use for an open source; raises NoPoses for `both` if it has none."""
     if poses in (GIVEN, TRACK):
         return Choice(source, poses)
     missing = _missing(source)
     if missing and poses == BOTH:
-        raise NoPoses(f"{missing}; without poses give track")
+        raise NoPoses(f"{missing}; give track instead")
     return Choice(source, TRACK, missing) if missing else Choice(source, poses or GIVEN)
 
 
@@ -98,11 +98,11 @@ def _missing(source: Stream) -> str:
     if not isinstance(source, Source) or not len(source):
         return "" if source.posed else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
     unposed = False
-    for i in np.unique(np.linspace(0, len(source) - 1, min(LOOKED_AT, len(source))).astype(int)).tolist():
+    for i in np.unique(np.linspace(0, len(source) - 1, min(INSPECTED, len(source))).astype(int)).tolist():
         frame = source.frame(i)
         if frame.fault is None and np.isfinite(frame.T_world_sensor).all():
             return ""
         unposed |= frame.fault is None or frame.fault in POSE_FAULTS
     if not unposed:
         return ""
-    return f"{source.name}: none of the frames looked at has a pose"
+    return f"{source.name}: none of the frames inspected has a pose"

@@ -2,7 +2,7 @@
 """Map a whole recording, simulation or live camera to disk, with checkpoints, resume and clean interrupts.
 
 The Python side of `stereovox map`: `map_recording` does it in one call, `MapRun` gives access to the mapper before the
-first frame. After `kill -9`, a full disk, Ctrl-C or SIGTERM the map on disk still opens, at most the frames since the
+first frame. After `kill -9`, a full disk, Ctrl-C or SIGTERM the map on disk still opens; at most the frames since the
 last checkpoint are lost, and `resume` continues as if nothing had happened.
 """
 
@@ -62,20 +62,20 @@ MAX_UNUSABLE = 100
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(MapOptions):
-    """Options of `map_recording`, in addition to those of `MapOptions`.
+    """Options of `map_recording`, in addition to `MapOptions`.
 
     Attributes:
-        resume: Continue the map at `out`; the frames it has already seen are skipped.
+        resume: Continue the map at `out`; frames that it has already seen are skipped.
         frames: Python slice that selects frames: `"::4"`.
         camera: Camera file that replaces the recording's own.
         level: Turn the recording's world so that z points up; the map is then level, but no longer in the
             coordinates of the recording's poses.
-        poses: `given`: those of the recording. `track`: the camera is tracked by its own images, in a world that
-            begins at its first one; frames in which it is lost are refused (`tracking_lost`). `both`: the camera
-            moves from frame to frame as the recording says, corrected by what the images show. None: given where there
-            are any, else tracked, which is passed to `notify`; with `resume` as the map was begun.
-        close_loops: Keep the frames, and at the end bend the camera's way so that what it saw again is one; see the
-            function of that name.
+        poses: `given`: the recording's own. `track`: the camera is tracked by visual odometry, in a world that begins
+            at its first image; frames in which tracking is lost are refused (`tracking_lost`). `both`: the recording's
+            motion from frame to frame, corrected by visual odometry. None: given if there are any, else tracked, with
+            a line to `notify`; with `resume` as the map was begun.
+        close_loops: Keep the frames, and at the end correct the camera's path so that revisited places coincide; see
+            the function of that name.
     """
 
     resume: bool = False
@@ -92,17 +92,17 @@ class MapResult(RunResult[MapT]):
 
     Attributes:
         map: The map, as saved: a `VoxelMap` or, from `map_floor`, a `GridMap`.
-        out: Where it was saved.
+        out: The path it was saved to.
         reports: One report for each frame of this run, in order.
         dropped: Number of frames that a live camera delivered while the mapper was busy.
         track: The robot's trajectory in the map, from `map_floor`; None if the odometry's poses were used.
         doubts: Why the map may be wrong, from `map_floor` with SLAM; empty if its self-check found nothing.
-        poses: Which were used: `given`, `track` or `both`.
-        lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
-        believed: Of poses `both`, the number of frames in which nothing known was in view, so that the recording's own
-            motion was taken as it is.
-        imu: What was made of the IMU of a camera that was tracked, in words; "" without one.
-        loops: Which loops were closed; None if none were sought.
+        poses: Which poses were used: `given`, `track` or `both`.
+        lost: Gaps in tracking, if poses were tracked: these frames are not in the map.
+        believed: With poses `both`, the number of frames in which nothing known was in view, so that the recording's
+            own motion was used unchanged.
+        imu: How the IMU of a tracked camera was used, in words; "" without one.
+        loops: The loops that were closed; None if nobody asked for a search.
     """
 
     dropped: int = 0
@@ -137,14 +137,14 @@ def map_recording(
 ) -> MapResult[VoxelMap]:
     """Map a recording, a simulation or a live camera, and save the map at regular checkpoints.
 
-    Without a profile, what a quick look at a recording suggests is used and passed to `notify`: which way is up, the
-    range and the cell size (see `survey`). Settings given here come first.
+    Without a profile, a quick survey of the recording suggests the up direction, the range and the cell size; these are
+    used and passed to `notify` (see `survey`). Settings given here take precedence.
 
     Args:
         source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own.
         out: Folder of the map to write. An older map there stays whole until the first save replaces it.
         observers: Called after each frame.
-        **options: Those of `RecordingOptions`, and settings by name, as for `Mapper`.
+        **options: Fields of `RecordingOptions`, and settings by name, as for `Mapper`.
 
     Returns:
         The map and the report of each frame.
@@ -169,7 +169,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
     Attributes:
         mapper: The mapper, once entered.
         source: The stream of frames, once entered.
-        poses: Which are used: `given`, `track` or `both`, once entered.
+        poses: Which poses are used: `given`, `track` or `both`, once entered.
         out: Folder of the map.
 
     Raises:
@@ -197,7 +197,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
             need_gtsam()
         saved = self._reserve(stack)
         suggested, lines = self._prepare(saved)
-        given_up = len(saved.kept_frames or ()) if saved else 0  # asked now, since the mapper goes on with that map
+        dropped = len(saved.kept_frames or ()) if saved else 0  # counted now, since the mapper changes that map
         self.mapper = self._make_mapper(saved, suggested)
         stack.callback(self.mapper.map.close)
         self._recorded = self.source
@@ -210,24 +210,24 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         self._check_recording()
         if saved is None and is_map(self.out):
             self._notify(replaces(self.out))
-        if given_up and self.mapper.map.kept_frames is None:
-            lost = f"the {given_up} frames that the map kept are given up (map.keep_frames=false)"
-            lines = [*lines, f"{lost}; its poses can then not be corrected any more"]
+        if dropped and self.mapper.map.kept_frames is None:
+            lost = f"the {dropped} frames that the map kept are dropped (map.keep_frames=false)"
+            lines = [*lines, f"{lost}; its poses can no longer be corrected"]
         for note in (*self.source.notes, *lines):
             self._notify(f"note: {note}")
 
     def _reserve(self, stack: ExitStack) -> VoxelMap | None:
-        """Keep others from writing to `out`; return the map there, if the run goes on with it."""
+        """Keep others from writing to `out`; return the map there if the run continues it."""
         resume = self._options.resume
         check_in_space(self.out)
         if resume and is_boxed(self.out):
             raise StereovoxError(
-                f"{self.out}: is a map in boxes; a fleet's is gone on with by: stereovox fleet RECORDING ... "
-                f"--out {self.out} --resume (name those that are in it, too)"
+                f"{self.out}: is a map in boxes; continue it with: stereovox fleet RECORDING ... "
+                f"--out {self.out} --resume (name the recordings in it too)"
             )
         check_target(self.out)
         if resume and not is_map(self.out):
-            raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
+            raise StereovoxError(f"{self.out}: no map to continue; start without resume")
         stack.enter_context(only_writer_in(self.out))
         sweep(self.out)
         saved = load_map(self.out) if resume else None
@@ -242,7 +242,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
 
         Args:
             observers: Called after each frame.
-            closing: Called while loops are sought: with how many are done, how many there are, and the current step.
+            closing: Called during the search for loops with the number done, the total, and the current step.
         """
         self._closing, self._lost = closing, LostSpans(frames_offered(self.mapper))
         return super().finish(observers)
@@ -253,7 +253,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
     def _end(self) -> MapResult[VoxelMap]:
         if not self.mapper.map.frames:
             why = self._first_refusal() or self.source.why_none
-            raise StereovoxError(f"{self.source.name}: not one frame could be used, no map is written ({why})")
+            raise StereovoxError(f"{self.source.name}: not one frame could be used, so no map is written ({why})")
         self._checkpoints.save(self._kept)
         closure = self._closure()
         made = MapResult(self.mapper.map, self.out, self.reports, self.source.dropped, poses=self.poses, loops=closure)
@@ -273,16 +273,16 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         return None if length is None else max(length - frames_offered(self.mapper), 0)
 
     def _prepare(self, saved: VoxelMap | None) -> tuple[dict[str, Any], list[str]]:
-        """Open the source; return settings that it suggests, and lines about them. A levelled world is turned here."""
+        """Open the source; return settings that it suggests, and lines about them. `level` turns the world here."""
         options = self._options
         source, self.poses, why = choose_poses(self._source, options.frames, self._poses_of(saved))
         self._check_tracked(source)
         self.source = source if options.camera is None else with_camera(source, str(options.camera))
         if saved and options.level and saved.config.levelled_from is None:
-            raise StereovoxError(f"level: {self.out} was begun without; go on without it, or begin a new map")
+            raise StereovoxError(f"level: {self.out} was begun without it; leave it out, or begin a new map")
         settings, lines = ({}, []) if saved else self._suggested(source)
         if why:
-            lines = [f"the camera is tracked by its own images, without poses ({why})", *lines]
+            lines = [f"the camera is tracked by visual odometry, since poses are missing ({why})", *lines]
         direction = saved.config.levelled_from if saved else self._level_direction(settings)
         if direction is not None:
             self.source = Turned(self.source, level_transform(direction))
@@ -290,27 +290,27 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         return settings if saved is None else {}, lines
 
     def _poses_of(self, saved: VoxelMap | None) -> str | None:
-        """Return which poses to use: those that were asked for, else those that the map was begun with."""
+        """Return which poses to use: those asked for, else those with which the map was begun."""
         if self._options.poses is not None or saved is None or not saved.recording:
             return self._options.poses
         return poses_of(saved.recording)
 
     def _check_tracked(self, source: Stream) -> None:
-        """Raise StereovoxError for what cannot be had with tracked poses."""
+        """Raise StereovoxError for options that tracked poses do not allow."""
         if self.poses == TRACK and self._options.level:
-            raise StereovoxError("level: a map with tracked poses has its own world, which is level; leave it out")
+            raise StereovoxError("level: a map with tracked poses is level already; leave it out")
         if self.poses != GIVEN and self._options.resume and source.length is None:
-            raise StereovoxError(f"{self.out}: a live camera does not know where in it it is; begin a new map")
+            raise StereovoxError(f"{self.out}: a live camera cannot be located in a saved map; begin a new one")
 
     def _suggested(self, source: Stream) -> tuple[dict[str, Any], list[str]]:
         """Return settings that a recording suggests if no profile chose them, and lines about them."""
         profile, level = self._options.profile, self._options.level
-        named = isinstance(self._source, str | Path) and isinstance(source, Source)  # a live camera cannot be looked at
+        named = isinstance(self._source, str | Path) and isinstance(source, Source)  # a live camera cannot be surveyed
         if not named or (profile is not None and not level):
             return {}, []
         found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
         if self.poses == TRACK:
-            found = replace(found, up=None)  # which is that of the recording's own poses
+            found = replace(found, up=None)  # it would be up by the recording's own poses
         settings = found.settings if profile is None else found.up_settings
         chosen, lines = settings(self._settings, LEVELLED if level else TILTED)
         if level and found.up is not None and found.up.sure:
@@ -318,21 +318,21 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         return chosen, lines
 
     def _level_direction(self, settings: Mapping[str, Any]) -> tuple[float, float, float] | None:
-        """Return what is up in the recording's world, None if it is not to be levelled.
+        """Return the up direction of the recording's world, None if it is not to be levelled.
 
-        Raises StereovoxError if nobody says it.
+        Raises StereovoxError if it is unknown.
         """
         if not self._options.level:
             return None
         chosen = {**settings, **self._profile_up(), **self._settings}
         if "up" not in chosen:
-            raise StereovoxError("level: which way is up in this recording is not certain; say it: --set up=AXIS")
+            raise StereovoxError("level: the up direction of this recording is uncertain; give it: --set up=AXIS")
         if chosen.get("up_direction") is None:
             return tuple(upright_axes(chosen["up"])[2].tolist())
         return load_config(up=chosen["up"], up_direction=chosen["up_direction"]).up_direction
 
     def _profile_up(self) -> dict[str, Any]:
-        """Return which way is up by the profile, where it says anything but the usual z."""
+        """Return the profile's up direction, unless it is the usual z."""
         config = load_config("default" if self._options.profile is None else self._options.profile)
         return {} if config.up == "z" else {"up": config.up, "up_direction": config.up_direction}
 
@@ -345,20 +345,20 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
 
     def _closure(self) -> LoopClosure | None:
-        """Close the loops of the map, if that is wanted, and save it again."""
+        """Close the loops of the map, if the options ask for it, and save it again."""
         if not self._options.close_loops:
             return None
 
-        def tell(done: int, total: int, doing: str) -> None:
+        def progress(done: int, total: int, doing: str) -> None:
             self._check()
             self._closing(done, total, doing)
 
-        closure = close(self.mapper, tell)
-        self._checkpoints.save(self._kept)  # also which places were refused
+        closure = close(self.mapper, progress)
+        self._checkpoints.save(self._kept)  # with the places that were refused
         return closure
 
     def _make_tracker(self) -> AnyTracker:
-        """Return a new tracker, the same each time; it is asked later what it did."""
+        """Return a new tracker, always of the same kind; `_end` later reads what it did."""
         config = self.mapper.config
         if self.poses == BOTH:
             self._tracker = GuidedTracker(config)
@@ -367,12 +367,12 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         return self._tracker
 
     def _check_recording(self) -> None:
-        """Check that the map is of this recording: of another one, the first frames would be skipped."""
+        """Check that the map is of this recording: otherwise its first frames would be skipped wrongly."""
         recorded_from = self.mapper.map.recording
         if recorded_from and recorded_from != self.source.name:
             raise StereovoxError(
-                f"{self.out}: was made of '{recorded_from}', not of '{self.source.name}'; go on with that, or start "
-                "anew without resume"
+                f"{self.out}: was made of '{recorded_from}', not of '{self.source.name}'; continue with that, or "
+                "start anew without resume"
             )
         self.mapper.map.recording = self.source.name
 
@@ -385,12 +385,12 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
                     "the same frames as before"
                 )
             self._check_last(done)
-            if done == length:  # whoever starts a run again after a kill need not know that it was complete
+            if done == length:  # a user who restarts a killed run need not know that it was complete
                 self._notify(f"{self.out} already holds all {done} frames of {self.source.name}")
                 return ()
-            self._notify(f"going on after frame {done}")
+            self._notify(f"continuing after frame {done}")
         frames = self.source.after(done) if done else self.source
-        if self.mapper.config.threads > 1 and isinstance(self._recorded, Source):  # any frame can be had at any time
+        if self.mapper.config.threads > 1 and isinstance(self._recorded, Source):  # frames can be read ahead
             frames = expecting(self.mapper.expect, frames)
         return frames
 
@@ -400,22 +400,22 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         endless = self.source.length is None and len(self.reports) == MAX_UNUSABLE
         if endless and all(report.refused for report in self.reports):
             left = f"{self.out} stays as it is" if self.mapper.map.frames else "no map is written"
-            why = f"not one of {MAX_UNUSABLE} frames could be used, {left} ({self._first_refusal()})"
+            why = f"not one of {MAX_UNUSABLE} frames could be used; {left} ({self._first_refusal()})"
             raise StereovoxError(f"{self.source.name}: {why}")
 
     def _stopped_line(self) -> str:
-        where = f"{self.out}, go on there with resume (--resume)"
+        where = f"{self.out}, continue with resume (--resume)"
         return f"stopped after {len(self.reports)} frames; they are saved in {where}"
 
     def _check_last(self, done: int) -> None:
         """Check the last frame in the map: with other `frames`, skipping by number would miss or repeat some."""
         last = self.mapper.map.history.last_frame
-        if self.source.length is None or last is None:  # a live camera; a map from before this was saved
+        if self.source.length is None or last is None:  # a live camera, or a map that does not record it
             return
         found = next(iter(self._recorded.after(done - 1)))
         if (one_line(found.name[:MAX_NAME_LENGTH]), found.stamp_ns) != last:
             raise StereovoxError(
-                f"{self.out}: its frame {done} was '{last[0]}', here it is '{found.name}'; choose frames as "
+                f"{self.out}: its frame {done} was '{last[0]}', but here it is '{found.name}'; choose frames as "
                 "before, or start anew without resume"
             )
 
@@ -434,10 +434,10 @@ def _saved_from_start(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
 
 
 def replaces(out: Path) -> str:
-    """Return a line about the map at `out` that the first save of a new one will replace."""
+    """Return a note about the map at `out` that the first save of a new one will replace."""
     try:
         manifest = read_manifest(out)
         made_of = f" made of '{one_line(str(manifest['recording']))}'" if manifest.get("recording") else ""
-        return f"note: {out} replaces the map of {manifest['frames']:,} frames{made_of} that is there"
+        return f"note: {out} replaces an older map of {manifest['frames']:,} frames{made_of}"
     except (MapFileError, KeyError, ValueError):
-        return f"note: {out} replaces a damaged map that is there"
+        return f"note: {out} replaces a damaged map"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A quick look at a recording before it is mapped: what it holds, which way is up, which settings suit it."""
+"""A quick survey of a recording before it is mapped: its contents, its up direction, and settings that suit it."""
 
 from __future__ import annotations
 
@@ -22,44 +22,44 @@ from stereovox.sources.base import Source, Stream
 from stereovox.track.tracker import LEVEL as AHEAD
 
 KINDS = {StereoFrame: "stereo", Frame: "depth", Cloud: "cloud"}
-"""What a recording consists of, by the type of its frames."""
+"""Kind of a recording, by the type of its frames."""
 RIGID = 0.05
-"""Largest entry of abs(R^T R - I) of a pose that is used here."""
+"""Largest entry of abs(R^T R - I) for a pose that is used here."""
 FRAMES = 16
 """Frames that are read, spread over the recording."""
 USUAL_RANGE_M, USUAL_CELL_M = 5.0, 0.05
-"""What `default` uses, kept where a recording gives no reason for anything else."""
+"""Values of `default`, kept unless a recording gives a reason to change them."""
 RANGES_M = (5.0, 8.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
 CELLS_M = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 FAR_SHARE = 0.1
-"""Share of the depths that must lie beyond the usual range to make it longer."""
+"""Share of the depths that must be beyond the usual range to make it longer."""
 NEAR_M = 1.2
 """A recording whose farthest depths are nearer gets smaller cells."""
 DISPARITY_ERROR_PX, DEPTH_ERROR = 0.5, 0.05
-"""Standard deviation of a disparity, and the largest relative one of a depth that is worth mapping."""
+"""Standard deviation of a disparity, and the largest relative one for a depth to be worth mapping."""
 MAX_CELLS_DEEP = 400
-"""Cells along the longest suggested depth, where the user chose their size."""
+"""Most cells along the longest suggested depth, if the user chose their size."""
 LEVEL_ENOUGH = np.radians(5.0)
-"""Angle up to which the nearest axis is taken for up."""
+"""Largest angle between up and the nearest axis at which that axis counts as up."""
 PICTURES_UPRIGHT = "pictures are turned upright"
-TILTED, LEVELLED = f"{PICTURES_UPRIGHT}, with --level the map is as well", "the map is turned upright"
-"""What becomes of a world that is not level, in words: of a fleet, of a map, and of one that is made level."""
+TILTED, LEVELLED = f"{PICTURES_UPRIGHT}, with --level the map is too", "the map is turned upright"
+"""How a world that is not level is handled, in words: for a fleet, for a map, and with --level."""
 LEVEL, UPRIGHT = np.radians(15.0), np.radians(40.0)
 """A surface counts as horizontal within the first angle; an axis points up within the second."""
 STEADY = 0.75
-"""Length of the mean of the cameras' own up directions; less means that the camera was turned over."""
+"""Least length of the mean of the cameras' own up directions; less means that the camera was turned over."""
 TURNED, UPRIGHT_SHARE = 0.5, 0.4
-"""Radians that a camera must turn for its turns to say something, and the share that is about the vertical then."""
+"""Radians that a camera must turn for its turns to be evidence, and the least share then about the vertical."""
 FIRST = 10
-"""Images at the start of which one must be there, to show what is level."""
+"""Frames at the start among which a first depth image must be, to find the up direction."""
 HORIZONTAL_SHARE = 0.06
-"""Share of the surface that must be horizontal (floor, tables, ceiling) to confirm which way is up."""
+"""Share of the surface that must be horizontal (floor, tables, ceiling) to confirm the up direction."""
 
 
 class UpEstimate(NamedTuple):
-    """Which way is up in the world of a recording.
+    """The up direction in the world of a recording.
 
-    axis: the world's axis that is nearest, `z`, `-y` and so on. direction: (3,) unit vector. off: angle between both in
+    axis: the nearest axis of the world, `z`, `-y` and so on. direction: (3,) unit vector. off: angle between both in
     radians. sure: whether there is enough evidence to use it. why: the evidence in words.
     """
 
@@ -84,13 +84,13 @@ class Suggestion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What a quick look at a recording found.
+    """The findings of a quick survey of a recording.
 
     Attributes:
         name: Name of the recording.
         kind: `depth`, `stereo` or `cloud`.
         frames: Number of frames.
-        seconds: Time from the first to the last frame; 0 where the recording has no times.
+        seconds: Time from the first to the last frame; 0 if the recording has no times.
         camera: Camera of all frames.
         read: Number of frames that were read for the figures below.
         faults: How many of these cannot be used, by reason.
@@ -99,14 +99,14 @@ class Survey:
         depth_m: (3,) metres: 5th, 50th and 95th percentile of the depths; None for stereo pairs.
         without_value: Share of pixels without depth; None for stereo pairs.
         depths_m: (N,) metres, a sample of all depths; empty for stereo pairs.
-        unit: Unit of the depth images in words; None if it is not known.
+        unit: Unit of the depth images in words; None if it is unknown.
         unit_m: The same in metres.
         unit_sure: Whether the images themselves confirm it.
-        unit_why: What speaks for the unit.
-        up: Which way is up; None without poses.
+        unit_why: The evidence for the unit.
+        up: The up direction; None without poses.
         max_range: Suggested longest depth in metres.
         voxel_size: Suggested side of a cell in metres.
-        notes: What the recording itself notes: assumptions, files left out.
+        notes: The recording's own notes: assumptions, omitted files.
     """
 
     name: str
@@ -135,10 +135,10 @@ class Survey:
 
         Args:
             given: Settings that the user chose, which are kept.
-            tilted: What is said to become of a world that is not level.
+            tilted: Words for how a world that is not level is handled.
 
         Returns:
-            Settings by name, and lines that say which, why, and how to override them.
+            Settings by name, and lines that give their values, the reasons, and the override.
         """
         chosen, lines = self._size_settings(given)
         up, said = self.up_settings(given, tilted)
@@ -163,22 +163,20 @@ class Survey:
         return chosen, [f"{what} ({why}); else give {' or '.join(options[name] for name in chosen)}"]
 
     def up_settings(self, given: Mapping[str, Any], tilted: str = TILTED) -> tuple[dict[str, Any], list[str]]:
-        """Choose which way is up.
+        """Choose the up direction.
 
         Args:
             given: Settings that the user chose, which are kept.
             tilted: As for `settings`.
 
         Returns:
-            As `settings`, about up alone.
+            As `settings`, for up alone.
         """
         if self.up is None or {"up", "up_direction"} & set(given):
             return {}, []
         if not self.up.sure:
             likely = f", perhaps {self.up.axis}" if self.up.axis != "z" else ""
-            return {}, [
-                f"which way is up is not certain{likely} ({self.up.why}); z is assumed, else give --set up=AXIS"
-            ]
+            return {}, [f"the up direction is uncertain{likely} ({self.up.why}); z is assumed, else give --set up=AXIS"]
         if self.up.off < LEVEL_ENOUGH:
             level, chosen = "", {"up": self.up.axis}
         else:
@@ -191,19 +189,19 @@ class Survey:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second; None if the recording has no times."""
+        """Frames per second; None if the recording has no times."""
         return (self.frames - 1) / self.seconds if self.seconds > 0 else None
 
 
 def survey(source: Source, frames: int = FRAMES) -> Survey:
-    """Look at a recording.
+    """Survey a recording.
 
     Args:
         source: The recording, from `open_source`.
         frames: Number of frames to read.
 
     Returns:
-        What was found; a frame that cannot be read only counts in `faults`.
+        The findings; an unreadable frame only counts in `faults`.
     """
     numbers = np.unique(np.linspace(0, len(source) - 1, min(frames, len(source))).astype(int)).tolist()
     read = [source.frame(i) for i in numbers]
@@ -240,7 +238,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
 
 
 def find_up(source: Source, frames: list[AnyFrame]) -> UpEstimate:
-    """Find out which way is up: as the layout defines it (`source.up`), by an accelerometer, else by what was seen.
+    """Find the up direction: as the layout defines it (`source.up`), by an accelerometer, or else by the images.
 
     Args:
         source: The recording.
@@ -259,23 +257,23 @@ def find_up(source: Source, frames: list[AnyFrame]) -> UpEstimate:
 
 
 def _seen_up(frames: Sequence[AnyFrame]) -> UpEstimate:
-    """Find out which way is up by what posed frames see.
+    """Find the up direction from posed frames.
 
-    A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
-    world; horizontal surfaces near it, such as floors and tables, then give the direction and confirm it.
+    A camera is mostly held upright, so the mean up direction of the images is near the world's; horizontal surfaces
+    close to that, such as floors and tables, then refine and confirm it.
     """
     mean = np.mean([_own_up(frame) for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:
         axis = nearest_axis(mean) if steady > 0 else "z"
-        return UpEstimate(axis, mean, float("nan"), False, "the camera was turned over on its way")
+        return UpEstimate(axis, mean, float("nan"), False, "the camera was turned over along its path")
     normals = [_normals(frame) for frame in frames if isinstance(frame, Frame) and frame.depth.size]
     normals = np.concatenate([np.empty((0, 3)), *normals])
     direction, share = _level_direction(mean / steady, normals)
     axis, off = _axis_near(direction)
     if _turns_level(frames, direction):
-        return UpEstimate(axis, direction, off, False, "the camera hardly turned about what is up in its images")
-    if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
+        return UpEstimate(axis, direction, off, False, "the camera hardly turned about the up direction of its images")
+    if not len(normals):  # the mean attitude alone suffices for the axis, not for the angle
         return UpEstimate(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
@@ -291,7 +289,7 @@ def _axis_near(direction: NDArray[np.float64]) -> tuple[str, float]:
 def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:
     """Return whether a camera turned mostly about axes that are level if `up` (3,) is right.
 
-    People and robots look round about the vertical: then it was held on its side.
+    People and robots turn about the vertical, so then the camera was held on its side.
     """
     R = [frame.T_world_sensor[:3, :3] for frame in frames]
     turns = np.array([before @ rotation_vector(before.T @ after) for before, after in pairwise(R)]).reshape(-1, 3)
@@ -300,23 +298,23 @@ def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:
 
 
 def level_start(source: Stream, config: Config) -> Transform:
-    """Return the pose (4, 4) of the first image of a camera that is tracked, in the world of its map.
+    """Return the pose (4, 4) of the first image of a tracked camera, in the world of its map.
 
-    The camera is at the origin. What is up follows from floors, tables and ceilings in the first image, where it shows
-    some near the vertical of the image; else the camera is taken to be level.
+    The camera is at the origin. The up direction follows from floors, tables and ceilings in the first image, if their
+    normals are near its vertical; else the camera is assumed to be level.
     """
     return level_pose(next(_first_images(source), None), config)
 
 
 def level_pose(first: Frame | None, config: Config) -> Transform:
-    """Return the same, (4, 4), of a first image; None: none shows what is level."""
+    """Return that pose (4, 4) for a first image, level for None."""
     found = None if first is None else _seen_up([replace(first, T_world_sensor=AHEAD, fault=None)])
     tilt = level_transform(found.direction) if found is not None and found.sure else np.eye(4)
     return level_world(config) @ tilt @ AHEAD
 
 
 def level_world(config: Config) -> Transform:
-    """Return the motion (4, 4) from a world whose z axis is up into one in which it is the axis of the settings."""
+    """Return the motion (4, 4) from a world with z up into one with the up direction of the settings."""
     return inverse(level_transform(up_of(config)))
 
 
@@ -333,7 +331,7 @@ def _first_images(source: Stream) -> Iterator[Frame]:
 def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bool) -> Suggestion:
     """Suggest the longest depth that is worth mapping.
 
-    depths: (N,) metres of a sample of pixels; empty for stereo pairs, which are not matched for this.
+    depths: (N,) metres of a sample of pixels; empty for stereo pairs, which are not matched here.
     """
     baseline = camera.baseline
     precise = DEPTH_ERROR * camera.fx * baseline / DISPARITY_ERROR_PX if baseline else np.inf
@@ -344,17 +342,17 @@ def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bo
     far = float(np.mean(depths > USUAL_RANGE_M)) if depths.size else 0.0
     if far < FAR_SHARE:
         return Suggestion(
-            USUAL_RANGE_M, f"{100 * far:.0f} % of the depths lie beyond" if far >= 0.005 else "no depth lies beyond"
+            USUAL_RANGE_M, f"{100 * far:.0f} % of the depths are beyond" if far >= 0.005 else "no depth is beyond"
         )
     needed = float(np.percentile(depths, 95))
     fitting = [m for m in RANGES_M if m <= 1.1 * precise]
     value = next((m for m in fitting if m >= 0.95 * needed), max(fitting, default=USUAL_RANGE_M))
     limit = f", the baseline is good to {precise:.1f} m" if value < 0.95 * needed else ""
-    return Suggestion(value, f"{100 * far:.0f} % of the depths lie beyond {USUAL_RANGE_M:g} m{limit}")
+    return Suggestion(value, f"{100 * far:.0f} % of the depths are beyond {USUAL_RANGE_M:g} m{limit}")
 
 
 def suggest_cell(depths: NDArray[np.float64], max_range: float) -> Suggestion:
-    """Suggest the side of a cell for depths (N,) in metres of a sample of pixels, and the range that is mapped."""
+    """Suggest the side of a cell from the depths (N,) in metres of a sample of pixels, and the mapped range."""
     if max_range > USUAL_RANGE_M:
         value = next((side for side in CELLS_M if side >= max_range / 200), CELLS_M[-1])
         return Suggestion(max(value, USUAL_CELL_M), f"a range of {max_range:g} m")
@@ -369,18 +367,18 @@ def _has_pose(frame: AnyFrame) -> bool:
 
 
 def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
-    """Return the direction (3,) in the world that is up where a sensor stands upright: lidars have other axes."""
+    """Return the direction (3,) in the world that is up if the sensor is upright; lidars have other axes."""
     return frame.T_world_sensor[:3, 2] if isinstance(frame, Cloud) else -frame.T_world_sensor[:3, 1]
 
 
 def _ranges(cloud: Cloud) -> NDArray[np.float64]:
-    """Return a sample of a cloud's ranges in metres, NaN if missing."""
+    """Return a sample of a cloud's ranges in metres, NaN for rays without a range."""
     ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
     return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
 
 
 def _depth_m(frame: Frame) -> NDArray[np.float64]:
-    """Return a sample of an image's depths in metres, NaN if missing."""
+    """Return a sample of an image's depths in metres, NaN for pixels without depth."""
     step = max(1, frame.depth.shape[1] // 160)
     depth = frame.depth[::step, ::step].astype(np.float64)
     depth[~(depth > 0) | ~np.isfinite(depth)] = np.nan
@@ -390,7 +388,7 @@ def _depth_m(frame: Frame) -> NDArray[np.float64]:
 
 
 def _normals(frame: Frame) -> NDArray[np.float64]:
-    """Return unit normals (N, 3) of surfaces in the world, towards the camera."""
+    """Return unit normals (N, 3) of surfaces in the world frame, towards the camera."""
     camera = frame.camera
     if not isinstance(camera, PinholeCamera):
         return np.empty((0, 3))
@@ -412,9 +410,9 @@ def _normals(frame: Frame) -> NDArray[np.float64]:
 
 
 def _level_direction(start: NDArray[np.float64], normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the normal of horizontal surfaces near `start` (3,), and the share of all that is horizontal.
+    """Return the normal of horizontal surfaces near `start` (3,), and the share of all normals that agree with it.
 
-    Ceilings count, turned over. Mean shift, from a wide angle to a narrow one.
+    Ceilings count too, flipped. Mean shift, from a wide angle to a narrow one.
     """
     direction = start
     for angle in np.linspace(np.radians(40), LEVEL, 6):

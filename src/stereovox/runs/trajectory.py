@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track a recording's or live camera's own motion into a trajectory: the Python side of `stereovox track`."""
+"""Track the motion of a recorded or live camera: the Python side of `stereovox track`."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class CameraTrack:
         name: Name of the recording.
         stamps_ns: (N,) int64, time of each frame in nanoseconds.
         T_world_sensor: (N, 4, 4) float64, maps the optical frame into a world that begins at the first image, z up;
-            NaN where the camera was lost.
-        covariances: (N, 6, 6) float64 of each pose on what was seen before, as `Tracked.covariance`; infinite where
-            the camera was lost.
-        lost: Where the camera was lost, and why.
+            NaN while tracking was lost.
+        covariances: (N, 6, 6) float64 of each pose relative to the earlier views, as `Tracked.covariance`; infinite
+            while tracking was lost.
+        lost: Gaps in tracking, and their causes.
         frame_ms: (N,) milliseconds that each frame took.
-        score: How far off it is from the poses that the recording has; None without.
-        imu: What was made of the IMU, in words; "" without one.
+        score: Its error against the recording's own poses; None without them.
+        imu: How the IMU was used, in words; "" without one.
     """
 
     name: str
@@ -71,39 +71,39 @@ class CameraTrack:
 
     @property
     def length_m(self) -> float:
-        """Metres along the poses; straight where the camera was lost between two."""
+        """Metres along the poses; straight across gaps in tracking."""
         poses = self.T_world_sensor[self.tracked]
         return float(travelled_m(poses)[-1]) if len(poses) else 0.0
 
     def poses(self) -> Poses:
-        """Return the poses that were found, over time.
+        """Return the tracked poses, over time.
 
         Raises:
-            SourceError: There is none.
+            SourceError: No frame has a pose.
         """
         return Poses(self.stamps_ns[self.tracked], self.T_world_sensor[self.tracked], where=f"{self.name}, tracked")
 
     def save(self, path: str | Path) -> None:
-        """Write the poses that were found as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.
+        """Write the tracked poses as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.
 
         Args:
             path: The file.
 
         Raises:
-            MapFileError: It cannot be written; an older one is then still there.
+            MapFileError: It cannot be written; an older file then stays.
         """
         found = self.tracked
         whose = "camera (x right, y down, z forward), tracked"
         write_trajectory(path, self.stamps_ns[found].tolist(), self.T_world_sensor[found], whose)
 
     def picture(self, file: str | Path) -> None:
-        """Draw the way: from above, its height, where the camera was lost, and errors if there is a score.
+        """Draw the trajectory: from above, its height, gaps in tracking, and errors if there is a score.
 
         Args:
             file: The picture to write: .png, .pdf or .svg.
 
         Raises:
-            StereovoxError: Another suffix, a file that cannot be written, or there is no pose.
+            StereovoxError: Unknown suffix, a file that cannot be written, or no frame has a pose.
         """
         from stereovox.view.figures import save
         from stereovox.view.trajectory import score_figure, way_figure
@@ -142,7 +142,7 @@ class CameraTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackOptions(RunOptions):
-    """Options of `track_recording` besides those of `RunOptions`; without a profile a quick look suggests the range.
+    """Options of `track_recording`, in addition to `RunOptions`; without a profile, a survey suggests the range.
 
     Attributes:
         frames: Python slice that selects frames: `"::4"`.
@@ -162,18 +162,18 @@ def track_recording(
     They are the poses that `map_recording` with `poses="track"` uses with the same settings.
 
     Args:
-        source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own. Its own poses are only
-            compared with.
-        out: File to write the poses to (`.tum` or `.txt`), all or nothing; None: none.
+        source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own. Its own poses serve only
+            for comparison.
+        out: File to write the poses to (`.tum` or `.txt`), all or nothing; None: no file.
         progress: Called with frames done, their number (0 for a live camera), and the current step.
-        **options: Those of `TrackOptions`, and settings by name, as for `Mapper`.
+        **options: Fields of `TrackOptions`, and settings by name, as for `Mapper`.
 
     Returns:
-        The pose of each frame, and where the camera was lost.
+        The pose of each frame, and the gaps in tracking.
 
     Raises:
         StereovoxError: One line: invalid source, settings or file, or not one frame could be tracked.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after writing what was tracked so far.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after writing the poses so far.
     """
     with _TrackRun(source, out, progress, TrackOptions.of(options)) as run:
         found = run.finish()
@@ -204,7 +204,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
         self._checkpoints = Checkpoints(self._save, self._target, 0)
 
     def _suggested(self) -> tuple[Config, list[str]]:
-        """Return the settings, those that a recording suggests among them, and lines about these."""
+        """Return the settings, including those that the recording suggests, and lines about these."""
         profile, given, stream = self._options.profile, self._options.settings, self._stream
         if profile is not None or not isinstance(stream, Source):
             return load_config("default" if profile is None else profile, **given), []
@@ -218,7 +218,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
         return follow(noted if self._stream.length is None else expecting(self._tracker.expect, noted), self._tracker)
 
     def _noting(self, frames: Iterable[AnyFrame]) -> Iterator[AnyFrame]:
-        """Yield frames, and take note of their own poses."""
+        """Yield frames, and record their own poses."""
         for frame in frames:
             self._given.append(_own_pose(frame))
             yield frame
@@ -234,7 +234,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
 
     @property
     def _kept(self) -> int:
-        """Number of frames whose poses are worth a file."""
+        """Number of frames whose poses would be saved."""
         return self._spans.frames if self._any and self._target is not None else 0
 
     def _stopped_line(self) -> str:
@@ -245,7 +245,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
             self._found().save(self._target)
 
     def _found(self) -> CameraTrack:
-        """Return what was found so far."""
+        """Return the trajectory so far."""
         nowhere = np.full((4, 4), np.nan)
         poses = [nowhere if tracked.lost else tracked.T_world_sensor for tracked in self._tracked]
         return CameraTrack(
@@ -264,12 +264,12 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
         found = self._found()
         if not found.tracked.any():
             why = found.lost[0].why if found.lost else "it is empty"
-            raise StereovoxError(f"{self._stream.name}: not one frame could be tracked, nothing is written ({why})")
+            raise StereovoxError(f"{self._stream.name}: not one frame could be tracked; nothing is written ({why})")
         self._save()
         return found
 
     def own_poses(self) -> NDArray[np.float64]:
-        """Return the recording's own poses (N, 4, 4), NaN if there are none."""
+        """Return the recording's own poses (N, 4, 4), NaN for missing ones."""
         given = np.array(self._given).reshape(-1, 4, 4)
         if self._stream.posed and np.isfinite(given).any():
             return given
@@ -284,7 +284,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
 
 
 def _own_poses(source: Source) -> NDArray[np.float64]:
-    """Return the poses (N, 4, 4) of a recording, NaN if there is none; without its images if it can do so."""
+    """Return the poses (N, 4, 4) of a recording, NaN for missing ones; if possible without reading its images."""
 
     def pose(i: int) -> Transform:
         try:
@@ -300,7 +300,7 @@ def _own_pose(frame: AnyFrame) -> NDArray[np.float64]:
 
 
 def _score(found: CameraTrack, given: NDArray[np.float64]) -> TrajectoryScore | None:
-    """Compare with the recording's own poses; None if there are too few, or the camera stands still."""
+    """Compare with the recording's own poses; None if there are too few, or the camera does not move."""
     known = np.isfinite(given).all(axis=(1, 2))
     if not known.any():
         return None

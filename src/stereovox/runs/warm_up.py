@@ -27,8 +27,8 @@ from stereovox.track.tracker import Tracker
 def warm_up(config: Config, tracked: bool = False, localised: bool = False, clouds: bool = False) -> None:
     """Load or compile all kernels that depth images need under these settings; the map is discarded.
 
-    tracked: those that tracking needs, too, by depth and by pictures; localised: those of localisation by a lidar;
-    clouds: those of clouds in a 3-D map.
+    tracked: also kernels for tracking, by depth and by pictures; localised: for localisation with a lidar; clouds: for
+    clouds in a 3-D map.
     """
     small = load_config(config, **{"window.outside": "drop"})
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
@@ -67,7 +67,7 @@ def warm_up(config: Config, tracked: bool = False, localised: bool = False, clou
 
 
 def _wall(metres: float) -> NDArray[np.float64]:
-    """Return points (N, 3) of a wall ahead, enough for all that clouds are checked for."""
+    """Return points (N, 3) of a wall ahead, enough to pass all checks of clouds."""
     across = np.linspace(-0.5, 0.5, 32) * metres
     y, z = (axis.ravel() for axis in np.meshgrid(across, across))
     return np.column_stack([np.full(y.size, metres), y, z])
@@ -86,7 +86,7 @@ def _warm_up_localization(config: Config) -> None:
     for scan in scans:
         slam.add(scan)
     grid = slam.grid()
-    if grid is None:  # no scan became part of a map: there is nothing to localise in
+    if grid is None:  # no scan was mapped: there is nothing to localise in
         return
     localiser = Localiser(grid, config, np.zeros(3))
     for scan in scans:
@@ -101,7 +101,7 @@ def _warm_up_localization(config: Config) -> None:
 
 
 def _scan_of_room(x: float) -> Scan:
-    """Return what a lidar sees at `x` metres from the middle of a room of 6 by 4 m with an alcove."""
+    """Return the scan of a lidar at `x` metres from the middle of a room of 6 by 4 m with an alcove."""
     angles = np.radians(np.arange(-120.0, 120.0))
     with np.errstate(divide="ignore"):
         across = np.where(np.cos(angles) > 0, 3.0 - x, 3.0 + x) / np.abs(np.cos(angles))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way of the camera is kept with the map: thinned, bounded, and the same for any split of a run."""
+"""The path of the camera is kept with the map: thinned, bounded, and the same for any split of a run."""
 
 import json
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map remembers of its sensors moves with their last frames."""
+"""A map's memory of its sensors moves with their last frames."""
 
 import numpy as np
 

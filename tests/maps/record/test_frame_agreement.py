@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a frame agrees with a map: the kernel against plain Python, in each kind of cell, whatever the order."""
+"""The agreement of a frame with a map: the kernel against plain Python, in each kind of cell, in any order."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from stereovox.config import load_config
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.record import frame_agreement
-from stereovox.maps.record.frame_agreement import FEW, KNOWN, LOOKED_THROUGH, Agreement
+from stereovox.maps.record.frame_agreement import FEW, KNOWN, SEEN_THROUGH, Agreement
 
 FIRM = 1600
 
@@ -32,7 +32,7 @@ def made(cell, seed=0, blocks=12):
 
 
 def slow(voxel_map, evidence):
-    """The same cell by cell, of what the map itself says of them."""
+    """The same cell by cell, from the map's own answers."""
     out = dict.fromkeys(("hits", "passes", "into_free", "at_edge", "every"), 0.0)
     stored = {tuple(c): cells for c, cells in zip(*voxel_map.storage.blocks(), strict=True)}
     rules = voxel_map.storage.rules
@@ -86,13 +86,13 @@ def test_a_frame_is_judged_by_what_is_known_alone():
     assert Agreement(FEW, 0.0, 0.0, 0.0, FEW).against == 0
     assert Agreement(FEW - 1, 0.0, 0.0, 0.0, FEW).against is None
     assert Agreement(FEW, 0.0, 0.0, 0.0, 1.01 * FEW / KNOWN).against is None
-    assert Agreement(300.0, 100 / LOOKED_THROUGH, 0.0, 0.0, 300.0).against == pytest.approx(0.25)
-    assert Agreement(0.0, FEW / LOOKED_THROUGH + 1, 0.0, 0.0, 2 * FEW).against == 1
-    assert Agreement(0.0, FEW / LOOKED_THROUGH - 1, 0.0, 0.0, 2 * FEW).against is None
+    assert Agreement(300.0, 100 / SEEN_THROUGH, 0.0, 0.0, 300.0).against == pytest.approx(0.25)
+    assert Agreement(0.0, FEW / SEEN_THROUGH + 1, 0.0, 0.0, 2 * FEW).against == 1
+    assert Agreement(0.0, FEW / SEEN_THROUGH - 1, 0.0, 0.0, 2 * FEW).against is None
     assert Agreement(300.0, 0.0, 100.0, 0.0, 300.0).against == 0.25
 
 
 def test_what_comes_to_light_at_the_edge_counts_no_more_than_the_rest():
     assert Agreement(300.0, 0.0, 200.0, 200.0, 300.0).against == 0
-    assert Agreement(300.0, 50 / LOOKED_THROUGH, 200.0, 200.0, 300.0).against == pytest.approx(0.25)
-    assert Agreement(300.0, 50 / LOOKED_THROUGH, 100.0, 50.0, 300.0).against == pytest.approx(1 / 3)
+    assert Agreement(300.0, 50 / SEEN_THROUGH, 200.0, 200.0, 300.0).against == pytest.approx(0.25)
+    assert Agreement(300.0, 50 / SEEN_THROUGH, 100.0, 50.0, 300.0).against == pytest.approx(1 / 3)

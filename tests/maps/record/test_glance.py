@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What two glances tell: things stay in the world, faults stay with the sensor, noise stays nowhere."""
+"""Two glances compared: things stay in the world, faults stay with the sensor, noise stays nowhere."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def rays(count=40, half=0.7):
 
 
 def walls(T, depth=4.0):
-    """A box of half a side `depth` round the world's origin, seen from T: points (N, 3) in the sensor's frame."""
+    """A box of half side `depth` around the world's origin, seen from T: points (N, 3) in the sensor's frame."""
     d = rays() @ T[:3, :3].T
     with np.errstate(divide="ignore"):
         far = np.min(np.where(d > 0, depth - T[:3, 3], -depth - T[:3, 3]) / d, axis=1)
@@ -80,7 +80,7 @@ def bins(points):
 
 
 def slowly_placed(ranges, points, tolerance):
-    """Where points lie among ranges, one after the other."""
+    """The places of points among ranges, one by one."""
     found = []
     for v, u, far, off in zip(*bins(points), np.linalg.norm(points, axis=1), tolerance, strict=True):
         around = ranges[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How old a map is, by a clock that the tests hold: current, stale after half a second, lost after five."""
+"""The age of a map, by a clock that the tests control: current, stale after half a second, lost after five."""
 
 import json
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map remembers of its frames goes to the file and comes back; a hostile file is refused in one line."""
+"""A map's memory of its frames is saved and loaded; a hostile file is refused in one line."""
 
 import json
 from collections import Counter

@@ -263,7 +263,7 @@ def index_of(folder):
 
 
 def put_index(folder, index):
-    """Write an index under the name that its content asks for, as an attacker would."""
+    """Write an index under the name that matches its content, as an attacker would."""
     content = json.dumps(index).encode()
     manifest = manifest_in(folder / "manifest.json")
     manifest["kept_frames"]["index"] = frame_store._name(content)

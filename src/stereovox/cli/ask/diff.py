@@ -21,8 +21,8 @@ stereovox diff monday.svox tuesday.svox --json"""
 KINDS = {
     "appeared": "appeared: free in A, occupied in B",
     "vanished": "vanished: occupied in A, free in B",
-    "became_known": "became known: B has seen them, A had not",
-    "became_unknown": "became unknown: A had seen them, B has not",
+    "became_known": "became known: seen in B, unknown in A",
+    "became_unknown": "became unknown: seen in A, unknown in B",
 }
 
 
@@ -36,7 +36,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Compare the maps and print how many cells changed."""
+    """Compare the maps and print the number of changed cells."""
     from stereovox.maps import State
     from stereovox.products.difference import difference, write_difference
     from stereovox.products.moved import moved

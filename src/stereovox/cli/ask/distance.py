@@ -50,7 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="from the cell's centre to the obstacle's (centres, default), to its nearest face (faces), or from the"
         " nearest point of the cell (gap)",
     )
-    parser.add_argument("--picture", metavar="FILE.png", help="picture of one layer to write as well")
+    parser.add_argument("--picture", metavar="FILE.png", help="also write a picture of one layer")
     parser.add_argument("--at", type=float, metavar="M", help="height of that layer (default: the camera's)")
 
 
@@ -76,14 +76,14 @@ def _check_files(arguments: Namespace) -> None:
     check_ending("FILE", arguments.file, ".npz")
     check_ending("--picture", arguments.picture, ".png")
     if arguments.at is not None and not arguments.picture:
-        raise StereovoxError("--at: the height of the layer to draw; it goes with --picture FILE.png")
+        raise StereovoxError("--at: is the height of the layer to draw; it needs --picture FILE.png")
 
 
 def _box(text: str | None, voxel_map: VoxelMap) -> NDArray[np.float64]:
     """Return the lowest and the highest corner (2, 3) in metres."""
     bounds = voxel_map.bounds()
     if bounds is None:
-        raise StereovoxError("the map is empty: there is nothing to be far from")
+        raise StereovoxError("the map is empty, so there are no distances; map something first")
     if text is None:
         return bounds
     return np.reshape(numbers_of("--box", text, CORNERS), (2, 3))
@@ -95,7 +95,7 @@ def _print_result(field: DistanceField, arguments: Namespace) -> dict[str, Any]:
     shape, largest = list(metres.shape), float(near.max()) if len(near) else None
     x, y, z = shape
     say(f"{x} x {y} x {z} cells from ({', '.join(f'{place:g}' for place in field.origin)}) m")
-    far = "no obstacle is near enough" if largest is None else f"up to {largest:.2f} m"
+    far = "none is near enough" if largest is None else f"distances up to {largest:.2f} m"
     say(f"{thousands(int(field.obstacles.sum()))} obstacles ({', '.join(('occupied', *arguments.to))}); {far}")
     say(f"saved {file} ({size(file.stat().st_size)})")
     return {
@@ -117,5 +117,5 @@ def _draw(field: DistanceField, voxel_map: VoxelMap, arguments: Namespace) -> No
         camera = voxel_map.viewpoint.T_world_camera[:3, 3]
         at_m = float(turned(camera, up)[2]) if np.isfinite(field.distance(camera))[0] else None
     to = " or ".join(("occupied", *arguments.to))
-    picture_distance(field, arguments.picture, up, at_m, f"{Path(arguments.map).stem}: distance to what is {to}")
+    picture_distance(field, arguments.picture, up, at_m, f"{Path(arguments.map).stem}: distance to {to} cells")
     say(f"saved {arguments.picture}")

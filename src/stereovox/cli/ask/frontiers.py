@@ -31,7 +31,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--heights", metavar="LO:HI", help="metres above the floor between which cells count (all)")
     parser.add_argument(
-        "--start", type=point, metavar="X,Y,Z", help="where the robot is, in metres (the camera of the last frame)"
+        "--start", type=point, metavar="X,Y,Z", help="position of the robot, in metres (the camera of the last frame)"
     )
     parser.add_argument("--radius", type=float, default=0.25, metavar="M", help="free radius that it needs (0.25)")
     parser.add_argument("--out", metavar="FILE.npz", help="file for the cells, centroids and viewpoints")
@@ -66,12 +66,12 @@ def _as_dict(frontier: Frontier) -> dict[str, Any]:
 
 
 def _print_frontiers(found: list[Frontier]) -> None:
-    say(f"{len(found)} frontiers" if found else "no frontier: no free cell lies next to an unknown one")
+    say(f"{len(found)} frontiers" if found else "no frontier: no free cell is next to an unknown one")
     for n, frontier in enumerate(found[:MAX_PRINTED], 1):
         summary = _as_dict(frontier)
-        where = "nowhere within reach" if summary["look_from"] is None else _format_point(summary["look_from"])
+        where = "no reachable place" if summary["look_from"] is None else _format_point(summary["look_from"])
         centroid = _format_point(summary["centroid"])
-        say(f"{n:4}: {thousands(summary['cells']):>7} cells about {centroid}; look from {where}")
+        say(f"{n:4}: {thousands(summary['cells']):>7} cells around {centroid}; view from {where}")
     if len(found) > MAX_PRINTED:
         say(f"      and {len(found) - MAX_PRINTED} smaller ones")
 

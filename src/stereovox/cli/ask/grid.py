@@ -84,4 +84,4 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
     say(cells_line(result))
     say(f"saved in {out.with_suffix('.yaml')}{but_few(result)}; look at it with: {picture_line(out)}")
     if not result["occupied"] and not result["free"]:
-        say("note: no cell is known yet: a single reading is too little evidence; map more")
+        say("note: no cell is known yet, since a single reading is too little evidence; map more")

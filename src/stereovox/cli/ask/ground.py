@@ -39,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         type=float,
         default=0.25,
         metavar="M",
-        help="radius of the robot, over which the slope is taken (0.25)",
+        help="radius of the robot, over which the slope is measured (0.25)",
     )
     parser.add_argument("--max-step", type=float, default=0.1, metavar="M", help="highest step the robot climbs (0.1)")
     parser.add_argument("--max-slope", type=float, default=20.0, metavar="DEG", help="steepest ground in degrees (20)")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check whether a body can follow a path through a map, where it is blocked, and how old the evidence is.
 
-The path is straight between its points; the body is a ball. Unknown cells block it, too.
+The path is straight between its points; the body is a ball. Unknown cells block it too.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _format_verdict(found: PathCheck, length: float, stopped: list[float] | None) -> str:
     if found.blocked_at is None or stopped is None:
-        return f"free: nothing is in the way on {length:.2f} m"
+        return f"free over {length:.2f} m"
     return f"blocked after {found.blocked_at:.2f} of {length:.2f} m, at {_format_point(stopped)}"
 
 

@@ -63,7 +63,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         kind = "rectified images" if pair.eyes is None else f"{pair.eyes.left.model} lenses"
         say(f"  {pair.name}: {kind}, {camera.width}x{camera.height} pixels, baseline {camera.baseline:.4f} m")
         if (camera.baseline or 0) > MAX_BASELINE_M:
-            say(f"  note: that is far apart; was {pair.name} calibrated in millimetres? The rig file needs metres")
+            say(f"  note: a long baseline; was {pair.name} calibrated in millimetres? The rig file needs metres")
     say(f"saved {arguments.out}; put the images and poses next to it: docs/rigs.md")
     pairs = [{"name": pair.name, "baseline_m": pair.camera.baseline, "rectified": pair.eyes is None} for pair in stereo]
     return {"pairs": pairs, "out": arguments.out}

@@ -3,7 +3,7 @@
 
 Record a flat, textured wall with a still camera from three or more distances, about 30 frames each, from the nearest to
 the farthest you will use. Only the middle of the image is used. Use the result with: stereovox map SOURCE --profile
-FILE. To compare light, emitter power or textures, name what each recording shows with --condition.
+FILE. To compare light, emitter power or textures, name those of each recording with --condition.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--region",
         default="0.6x0.4",
         metavar="WxH",
-        help="metres of the wall around its middle that are used (%(default)s)",
+        help="part of the wall around its middle to use, in metres (%(default)s)",
     )
     parser.add_argument(
         "--condition",
@@ -103,7 +103,7 @@ def profile_text(found: NoiseCalibration) -> str:
     if found.subpixel is not None:
         lines.append(f"# s2 is a disparity error of {found.subpixel:.4f} px")
     lines += [f"# {point.distance_m:.3f} m: RMSE {1000 * point.rmse_m:.2f} mm" for point in found.points]
-    lines += ["# correlation_px: errors of neighbouring pixels are alike as smoothed by a Gaussian of so many pixels"]
+    lines += ["# correlation_px: errors of neighbouring pixels correlate as if smoothed by a Gaussian of this width"]
     names = ("s0", "s1", "s2", "correlation_px")
     lines += ["[noise]", *(f"{name} = {float(getattr(found, name))!r}" for name in names)]
     return "\n".join(lines) + "\n"
@@ -119,19 +119,19 @@ def _print_result(found: NoiseCalibration, out: str) -> None:
         subpixel = "" if point.subpixel is None else f", sub-pixel {point.subpixel:.3f}"
         say(
             f"  at {point.distance_m:.2f} m: RMSE {1000 * point.rmse_m:.2f} mm{parts}{subpixel}, "
-            f"{point.valid_share:.1%} of the pixels valid, {_alike(point)}"
+            f"{point.valid_share:.1%} of the pixels valid, {_independent(point)}"
         )
     for one in found.conditions:
         say(f"  {_condition(one)}")
     subpixel = "" if found.subpixel is None else f"; s2 is {found.subpixel:.4f} px of disparity"
     say(f"sigma(z) = {found.s0:.3g} + {found.s1:.3g} z + {found.s2:.3g} z^2 m{subpixel}")
-    say(f"errors of neighbouring pixels are alike over a Gaussian of {found.correlation_px:.2f} px")
-    say("fitted to the whole RMSE: an error that stays the same does not average out, so it belongs into sigma")
+    say(f"errors of neighbouring pixels correlate over a Gaussian of {found.correlation_px:.2f} px")
+    say("fitted to the whole RMSE: a constant error does not average out, so it belongs to sigma")
     say(f"saved {out}; use it with: stereovox map SOURCE --out MAP --profile {out}")
 
 
-def _alike(point: NoiseAt) -> str:
-    return f"8x8 of them are {point.looks:.1f} independent looks"
+def _independent(point: NoiseAt) -> str:
+    return f"8x8 of them count as {point.looks:.1f} independent ones"
 
 
 def _condition(one: ConditionNoise) -> str:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrate the pose of a depth camera on a tracker, and their clock offset, from a recording of both.
 
-RECORDING is a folder with depth images and a tracker's poses (tracker.txt, or as its pair.toml says). Move both for
-ten seconds or more in a furnished room: rotate by 20 degrees or more in pitch, yaw and roll, not too fast.
+RECORDING is a folder with depth images and a tracker's poses (tracker.txt, or the file in its pair.toml). Move both
+for ten seconds or more in a furnished room: rotate by 20 degrees or more in pitch, yaw and roll, not too fast.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         found = _calibrate(depth, folder, settings, arguments.within)
     except StereovoxError as error:
         if type(error) is not StereovoxError:
-            raise  # a file or library that is missing
+            raise  # a missing file or library
         raise StereovoxError(f"{_too_short(depth)}{error}") from None
     _print_result(found)
     _write(arguments, folder, settings, found)
@@ -112,12 +112,12 @@ def _print_result(found: PairCalibration) -> None:
     turn = np.degrees(rotation_vector(found.T_tracker_camera[:3, :3]))
     place = 1000 * found.T_tracker_camera[:3, 3]
     say(f"clock_offset_s {found.clock_offset_s:.4f}, standard deviation {1000 * found.offset_std_s:.1f} ms")
-    say(f"camera seen from the tracker (x right, y down, z forward): {_format_xyz(place, '+.1f')} mm,")
+    say(f"camera in the tracker's frame (x right, y down, z forward): {_format_xyz(place, '+.1f')} mm,")
     say(f"  standard deviations {_format_xyz(1000 * found.translation_std_m, '.1f')} mm")
     turn_std = _format_xyz(found.rotation_std_deg, ".2f")
     say(f"  turned by {_format_xyz(turn, '+.2f')} deg, standard deviations {turn_std} deg")
     fit = f"{found.rotation_residual_deg:.2f} deg and {1000 * found.translation_residual_m:.1f} mm"
-    say(f"{found.pairs} of {found.images} images count; camera and tracker agree within {fit} (median)")
+    say(f"{found.pairs} of {found.images} images used; camera and tracker agree within {fit} (median)")
     degrees, metres = UNCERTAIN
     if found.rotation_std_deg.max() > degrees or found.translation_std_m.max() > metres:
         say("note: this is uncertain; record for longer, with more pitch, yaw and roll, near corners and furniture")

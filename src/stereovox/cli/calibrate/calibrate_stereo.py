@@ -76,7 +76,7 @@ def _write(arguments: Namespace, found: StereoCalibration) -> None:
 
     model = arguments.rectify or ("spherical" if found.eyes.left.model == "fisheye" else "pinhole")
     pair = RigPair(arguments.name, eyes=found.eyes, virtual=Virtual(model))
-    pair.stereo_pair(Path(arguments.out).parent)  # a rig file that cannot be used is not written
+    pair.stereo_pair(Path(arguments.out).parent)  # raises before an unusable rig file is written
     used = f"{len(found.used)} of {len(found.pairs)} pairs of {Path(arguments.folder).resolve().name}"
     figures = f"RMS {found.overall('rms_px'):.3f} px, epipolar {found.overall('epipolar_px'):.3f} px"
     with replacing(arguments.out) as file:
@@ -86,23 +86,23 @@ def _write(arguments: Namespace, found: StereoCalibration) -> None:
 def _print_result(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> None:
     for pair in found.pairs:
         if pair.why:
-            say(f"  {pair.name}: left out, {pair.why}")
+            say(f"  {pair.name}: skipped, {pair.why}")
         else:
-            say(f"  {pair.name}: corners missed by {pair.rms_px:.3f} px RMS, rows by {pair.epipolar_px:.3f} px")
+            say(f"  {pair.name}: corners off by {pair.rms_px:.3f} px RMS, rows by {pair.epipolar_px:.3f} px")
     if alone:
         more = f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else ""
-        say(f"note: no partner of the other eye for {', '.join(alone[:SHOWN])}{more}")
+        say(f"note: no image of the other eye for {', '.join(alone[:SHOWN])}{more}")
     figures = found.as_dict()
     unseen_px = figures["unseen_px"]
     unseen = "" if unseen_px is None else f" ({unseen_px:.3f} px in pairs the calibration has not seen)"
-    say(f"{figures['used']} of {len(found.pairs)} pairs: corners missed by {figures['rms_px']:.3f} px RMS,")
+    say(f"{figures['used']} of {len(found.pairs)} pairs: corners off by {figures['rms_px']:.3f} px RMS,")
     say(f"  rows after rectification by {figures['epipolar_px']:.3f} px{unseen}")
     say(f"baseline {1000 * figures['baseline_m']:.2f} mm; fields of view {_format_fields(figures)} deg")
     if figures["baseline_m"] > MAX_BASELINE_M:
         length = f"{figures['baseline_m']:.4g} m is a long baseline"
-        say(f"note: {length}; --square {arguments.square:g}: millimetres? Give metres")
+        say(f"note: {length}; is --square {arguments.square:g} in millimetres? Give metres")
     if max(figures["rms_px"], figures["epipolar_px"]) > GOOD_PX:
-        say("note: that is a lot; is the board flat, the picture sharp, and --lens right? See the report")
+        say("note: these errors are large; is the board flat, the picture sharp, and --lens right? See the report")
     if len(found.used) < 10:
         say("note: few pairs; take ten or more, in all corners of the images")
     say(f"saved {arguments.out}")

@@ -34,7 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--square",
         action="store_true",
-        help="the walls are exactly perpendicular to the optical axis; else their tilt is estimated",
+        help="the walls are exactly perpendicular to the optical axis; otherwise their tilt is estimated",
     )
     parser.add_argument(
         "--check", action="append", default=[], metavar="RECORDING", help="a wall to test the result on; repeatable"

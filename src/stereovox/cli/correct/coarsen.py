@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a map of larger cells; each takes the worst state of its parts: occupied, then tentative, unknown, free."""
+"""Make a map of larger cells; each gets the worst state of its parts: occupied, then tentative, unknown, free."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load the map and save it in larger cells."""
+    """Load the map and save it with larger cells."""
     from stereovox.products.coarsen import coarsen
 
     check_new(arguments.out, arguments.map)

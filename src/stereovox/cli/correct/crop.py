@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Crop a map to a box: the new map holds the cells whose centre lies inside."""
+"""Crop a map to a box: the new map holds the cells whose centre is inside."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--box",
         metavar=CORNERS,
         required=True,
-        help="lowest and highest corner in metres; inf and -inf for no limit. Write --box=... where it begins with -",
+        help="lowest and highest corner in metres; inf and -inf for no limit. Write --box=... if it begins with -",
     )
 
 
@@ -37,5 +37,5 @@ def run(arguments: Namespace) -> dict[str, Any]:
     bounds = whole.bounds()
     if part.bounds() is None and bounds is not None:
         low, high = bounds.round(3).tolist()
-        raise StereovoxError(f"--box {arguments.box}: no known cell there; the map reaches from {low} to {high} m")
+        raise StereovoxError(f"--box {arguments.box}: holds no known cell; the map extends from {low} to {high} m")
     return save_new(part, arguments.out)

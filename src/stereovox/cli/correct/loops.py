@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find where the camera of a map came back, and bend its way so that what it saw twice is one.
+"""Close the loops of a map: find revisited places, and correct the camera's path so that they coincide.
 
 The map must have kept its frames (map --set map.keep_frames=true; map --close-loops does both). Places are compared by
-their surfaces; one that looks the same is believed where nothing else within reach does, the poses allow it and another
-finding agrees. The result is bit for bit the map of a new run with the corrected poses.
+their surfaces; a match is accepted if no other place within reach matches, the poses allow it and another match agrees.
+The result is bit for bit the map of a new run with the corrected poses.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 EXAMPLES = """stereovox loops kitchen.svox
 stereovox loops kitchen.svox --json"""
 SHOWN, FAR_M = 5, 1.5
-"""Refused places that are listed; and how far off poses may be before it is said what may be wrong."""
+"""Most rejected places that are listed; and error of the poses from which on a note warns of a confusion."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -29,21 +29,21 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("map", metavar="MAP", help="folder of a map that kept its frames")
     parser.add_argument("--out", metavar="OUT", help="folder of the new map (default: NAME-closed.svox here)")
     parser.add_argument("--trajectory", metavar="FILE", help="write the corrected poses: .tum or .txt")
-    about = "the way before and after from above, the loops, and the map where poses were most off: .png, .pdf or .svg"
+    about = "the path before and after, the loops, and the map where poses were most off: .png, .pdf or .svg"
     parser.add_argument("--picture", metavar="FILE", help=about)
     parser.add_argument(
         "--positions", metavar="FILE",
-        help="positions of the camera that do not drift, as of GNSS: lines as --trajectory writes, in metres, or a bag "
-        "with sensor_msgs/NavSatFix",
+        help="positions of the camera that do not drift, as from GNSS: lines as --trajectory writes, in metres, or a "
+        "bag with sensor_msgs/NavSatFix",
     )  # fmt: skip
     parser.add_argument("--positions-sigma", type=float, default=1.0, metavar="M", help="their standard deviation (1)")
-    about = "a second odometry, as of wheels: poses of the camera, lines as --trajectory writes"
+    about = "a second odometry, as from wheels: poses of the camera, lines as --trajectory writes"
     parser.add_argument("--odometry", metavar="FILE", help=about)
     add_settings(parser, "loops.drift=0.05")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Close the loops and print what was found."""
+    """Close the loops and print the result."""
     from stereovox.correct.close_loops import close_loops
     from stereovox.files.safe_io import check_file
     from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS
@@ -56,7 +56,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         if file:
             check_file(file, endings)
     say_about_compiling()
-    with progress_of_steps("looking for loops") as progress:
+    with progress_of_steps("searching for loops") as progress:
         done = close_loops(
             arguments.map, out, positions=arguments.positions, positions_sigma=arguments.positions_sigma,
             odometry=arguments.odometry, progress=progress, **overrides(arguments),
@@ -81,27 +81,27 @@ def _picture(done: ClosedMap, arguments: Namespace) -> None:
 
 
 def say_closure(closure: LoopClosure) -> None:
-    """Print which loops were found, and what they changed."""
+    """Print the loops that were found, and what they changed."""
     summary = closure.summary()
     if closure.loops:
         off = summary["off_m"]["max"]
-        say(f"{len(closure.loops)} loops closed; there the poses were off by up to {off:.2f} m")
+        say(f"{len(closure.loops)} loops closed, where the poses were off by up to {off:.2f} m")
         if off > FAR_M:
-            say("note: places that look alike and lie no farther apart may be taken for one another; look at the map")
+            say("note: similar places no farther apart than that may have been confused; check the map")
     else:
-        say(f"no loops were found: of {len(closure.places)} places, none is surely seen twice")
+        say(f"no loop was found: none of the {len(closure.places)} places was certainly seen twice")
     if closure.odometry is not None:
         used, other = closure.odometry.used, closure.odometry.contradicted
-        say(f"the second odometry had a part in {used} steps between places; in {other} it contradicts the map's poses")
+        say(f"the second odometry was used in {used} steps between places; in {other} it contradicts the map's poses")
     if closure.positions is not None:
         used, other = closure.positions.used, closure.positions.contradicted
-        say(f"{used} places of the way are where the positions say, {other} are not")
+        say(f"{used} places of the path agree with the positions, {other} do not")
     moved = summary["moved_m"]
     say(f"frames moved by {moved['median']:.3f} m (median), at most {moved['max']:.3f} m")
     if not closure.report.all_frames:
-        say(f"note: only {len(closure.stamps_ns)} frames were kept (map.frames_budget); the map is what these make")
+        say(f"note: only {len(closure.stamps_ns)} frames were kept (map.frames_budget); the map is made of these")
     if closure.refused:
-        say(f"{len(closure.refused)} places look the same and were not believed to be:")
+        say(f"{len(closure.refused)} places look the same but were rejected as loops:")
     for one in summary["loops_refused"][:SHOWN]:
         say(f"  {one['at']} like {one['like']}: {one['why']}")
     if len(closure.refused) > SHOWN:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Merge two maps; the result has the frame and the settings of A.
 
-Maps that kept their frames (map.keep_frames) become exactly the map of one run over both. The evidence of others is
-added up, and a line says what that cannot promise.
+Maps that kept their frames (map.keep_frames) become exactly the map of one run over both. For other maps evidence is
+added up, and a note says how the result may differ.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_transform(parser)
     parser.add_argument(
         "--find", action="store_true",
-        help="find where B lies in A by what both saw, and bend both so that it is one (maps that kept their frames)",
+        help="find the pose of B in A by places that both saw, and correct both (maps that kept their frames)",
     )  # fmt: skip
 
 
@@ -44,7 +44,7 @@ def add_transform(parser: ArgumentParser) -> None:
         "--transform",
         metavar="T",
         help="pose of B's frame in A's (default: the same frame): tx,ty,tz,qx,qy,qz,qw in metres and a quaternion, or"
-        " a file with these or with a 4x4 matrix T_a_b. Write --transform=... where it begins with -",
+        " a file with these or with a 4x4 matrix T_a_b. Write --transform=... if it begins with -",
     )
 
 
@@ -53,7 +53,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.correct.merge_maps import frames_in_both, merge, why_added
 
     if Path(arguments.a).resolve() == Path(arguments.b).resolve():
-        raise StereovoxError(f"{arguments.b}: is the first map too, its frames would count twice; name another map")
+        raise StereovoxError(f"{arguments.b}: is also the first map, so its frames would count twice; name another map")
     if arguments.find:
         return _joined(arguments)
     T_a_b = None if arguments.transform is None else transform_of(arguments.transform)
@@ -70,21 +70,21 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _doubts(merged: VoxelMap) -> Doubts:
-    """Return whether most of what came for both maps is in none."""
+    """Return a doubt if most of the frames of both maps are missing from the result."""
     from stereovox.evaluate.summary import mostly_lost
 
     return mostly_lost(merged.frames, merged.frames + merged.frames_refused, "frames of both")
 
 
 def _joined(arguments: Namespace) -> dict[str, Any]:
-    """Find where the second map lies, and save the map of both."""
+    """Find the pose of the second map in the first, and save the map of both."""
     from stereovox.correct.merge_maps import join
 
     if arguments.transform is not None:
         raise StereovoxError("--find: finds the transform; leave --transform out")
     check_new(arguments.out, arguments.a, arguments.b)
     a, b = open_map(arguments.a), open_map(arguments.b)
-    with progress_of_steps("looking for loops") as progress:
+    with progress_of_steps("searching for loops") as progress:
         done = join(a, b, progress)
     x, y, z = done.T_a_b[:3, 3]
     turn = np.degrees(np.linalg.norm(rotation_vector(done.T_a_b[:3, :3])))

@@ -3,7 +3,7 @@
 
 .bt and .ot for OctoMap, .ply and .pcd for point cloud viewers, .npz for NumPy, .glb for browsers and Blender, .obj and
 .stl for 3-D tools, .rrd for the Rerun viewer; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for
-map_server: the map from above, as an image and its .yaml. A floor map (.yaml) can be exported to a bag as well.
+map_server: the map from above, as an image and its .yaml. A floor map (.yaml) can be exported to a bag too.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--heights",
         metavar="LO:HI",
-        help="2-D maps and bags: metres above the floor that a robot occupies (scan.heights); free is what was"
-        " seen free in all of them",
+        help="2-D maps and bags: metres above the floor that a robot occupies (scan.heights); a cell is free if it was"
+        " seen free at all of them",
     )
     parser.add_argument(
         "--floor",
@@ -40,7 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="2-D maps and bags: height in metres of a level floor in the world (found at each place)",
     )
     parser.add_argument(
-        "--start", type=point, metavar="X,Y,Z", help="2-D maps and bags: a place near the floor that counts, of several"
+        "--start", type=point, metavar="X,Y,Z", help="2-D maps and bags: a place near the floor to use, if several"
     )
     parser.add_argument(
         "--inflate",
@@ -68,12 +68,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if isinstance(floor, FloorHeights) and floor.known:
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
         say(f"seen from above: {low:g} to {high:g} m above the floor, which is {_format_floor(floor)}")
-        say("free is what was seen free in all of that; for a lower robot: --heights LO:HI")
+        say("cells are free if seen free at all these heights; for a lower robot: --heights LO:HI")
     elif flat:
-        say(f"no 2-D map in it: {NO_FLOOR}; {CURE}")
+        say(f"without a 2-D map: {NO_FLOOR}; {CURE}")
     if arguments.inflate is not None:
         result["inflated_m"] = arguments.inflate
-        say(f"obstacles grown by {arguments.inflate:g} m and one cell")
+        say(f"obstacles inflated by {arguments.inflate:g} m and one cell")
     if ending in FLAT:
         beside = f" and {file.with_suffix('.pgm' if ending == '.yaml' else '.yaml')}"
     say(f"saved {file}{beside} ({size(result['bytes'])})")
@@ -92,7 +92,7 @@ def _export_floor(arguments: Namespace) -> dict[str, Any]:
     from stereovox.formats.bags import write_grid_bag
     from stereovox.formats.map_server import read_map_server
 
-    refuse_options(arguments, ["heights", "inflate", "floor", "start"], "a floor's map goes into a bag as it is")
+    refuse_options(arguments, ["heights", "inflate", "floor", "start"], "a floor map is written to a bag unchanged")
     write_grid_bag(read_map_server(arguments.map), arguments.file)
     say(f"saved {arguments.file}")
     return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}

@@ -78,7 +78,7 @@ def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoOutput]:
         stopped = None
         try:
             yield RerunRecording(mapper, RerunLog(opened, DepthPipeline(mapper.config)))
-        except KeyboardInterrupt as interrupt:  # the map is saved so far, and so is this
+        except KeyboardInterrupt as interrupt:  # the map so far is saved, and so is this
             stopped = interrupt
     say(f"saved {file}; look at it with: rerun {file}")
     if stopped is not None:

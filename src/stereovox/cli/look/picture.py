@@ -45,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
     parser.add_argument("--dark", action="store_true", help="a dark page, for dark slides and sites")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
-    parser.add_argument("--dpi", type=float, metavar="N", help="dots an inch (120; with --width-mm 600)")
+    parser.add_argument("--dpi", type=float, metavar="N", help="dots per inch (120; with --width-mm 600)")
     parser.add_argument(
         "--width-mm",
         type=float,
@@ -62,7 +62,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     arguments.file = arguments.file or _usual_file(arguments.map)
     file = Path(arguments.file)
     if file.suffix.lower() not in ENDINGS:
-        raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
+        raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; end the file's name with one")
     heading = _plain(arguments.title or Path(arguments.map).stem)
     drawn = DRAW[dimensions(arguments.map)](arguments, heading)
     if arguments.dark:
@@ -73,12 +73,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _usual_file(path: str) -> str:
-    """Return the name of the picture if none is given; raises StereovoxError if that would replace a file."""
+    """Return the default name of the picture; raises StereovoxError if that would replace a file."""
     from stereovox.descriptions.description import command_line, picture_name
 
     name = picture_name(path)
     if Path(name).exists():
-        raise StereovoxError(f"{name}: is here already; replace it with: {command_line('picture', path, name)}")
+        raise StereovoxError(f"{name}: already exists; replace it with: {command_line('picture', path, name)}")
     return name
 
 
@@ -96,7 +96,7 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     if arguments.up is None and voxel_map.config.up_direction is not None:
         voxel_map = levelled(voxel_map)
         heading = heading if arguments.title else f"{heading}, turned upright"
-        say("note: turned upright for the picture: its axes are not those of the map itself")
+        say("note: turned upright for the picture, so its axes differ from the map's")
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     if arguments.width_mm is None:
@@ -114,7 +114,7 @@ def _draw_grid(arguments: Namespace, heading: str) -> Any:
     from stereovox.view.grid import draw_grid
 
     refuse_options(
-        arguments, ("view", "at", "up", "eye", "toward", "width_mm"), f"{arguments.map} is a floor's map, always a plan"
+        arguments, ("view", "at", "up", "eye", "toward", "width_mm"), f"{arguments.map} is a floor map, always a plan"
     )
     check_not_map_image(arguments.file, arguments.map)
     return draw_grid(open_grid(arguments.map), heading)
@@ -128,7 +128,7 @@ def _check_options(arguments: Namespace) -> None:
     for name in ("at", "eye", "toward") if arguments.view in VIEW_OPTIONS else ():
         if getattr(arguments, name) is not None and name not in VIEW_OPTIONS[arguments.view]:
             users = ", ".join(f"--view {view}" for view, options in VIEW_OPTIONS.items() if name in options)
-            raise StereovoxError(f"--{name}: the view '{arguments.view}' does not use it; it goes with: {users}")
+            raise StereovoxError(f"--{name}: the view '{arguments.view}' does not use it; use it with: {users}")
 
 
 def _note_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
@@ -137,9 +137,9 @@ def _note_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
         return
     low, high = sorted(bounds[:, "xyz".index(up[-1])] * (-1 if up.startswith("-") else 1) + 0.0)  # no "-0"
     if not low <= at_m < high:
-        say(f"note: --at {at_m:g} is outside the map ({up} = {low:g} to {high:g} m): all cells there are unknown")
+        say(f"note: --at {at_m:g} is outside the map ({up} = {low:g} to {high:g} m), so all its cells are unknown")
 
 
 def _plain(text: str) -> str:
-    """Return text that matplotlib draws literally: no formulas, no undecodable bytes."""
+    """Return text that matplotlib draws literally, without formulas or undecodable bytes."""
     return text.encode("utf-8", "replace").decode().replace("$", r"\$")

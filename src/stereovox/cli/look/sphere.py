@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Show the distances to the nearest obstacles around a vehicle.
 
-SOURCE is anything that `map` takes; the last frame of each camera counts, seen from where the vehicle is at the end.
+SOURCE is anything that `map` takes; the last frame of each camera counts, seen from the vehicle's last pose.
 sim:surround is a drone with four stereo cameras.
 """
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 EXAMPLES = """stereovox sphere sim:surround --frames :4 --out sphere.png --step 2
 stereovox sphere sim:surround --frames :1 --out one.png"""
 STEP_DEG = 1.0
-"""Default where neither the options nor the profile set a step."""
+"""Default if neither the options nor the profile set a step."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, or a simulation")
     parser.add_argument("--out", metavar="FILE.png", help="picture of all directions to write")
-    parser.add_argument("--step", type=float, metavar="DEG", help=f"width of a cell (the profile's, else {STEP_DEG:g})")
+    parser.add_argument("--step", type=float, metavar="DEG", help=f"width of a cell (the profile's, or {STEP_DEG:g})")
     add_usual(parser, "frames")
     parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (default)")
     add_usual(parser, "max-range")
@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     for note in stream.notes:
         _note(note)
     say_about_compiling()
-    grid, now_ns, refused = vehicle_grid(tracked(stream, stream.length, "looking"), config, _note)
+    grid, now_ns, refused = vehicle_grid(tracked(stream, stream.length, "reading"), config, _note)
     sights = surroundings(grid)
     result = {
         "step_deg": config.sphere.step_deg,

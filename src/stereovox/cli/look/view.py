@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""View a map in the browser: turn it, cut it, measure in it, and replay the recording it was made from."""
+"""View a map in the browser: turn it, cut it, measure in it, and replay the recording that it was made from."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--token",
         metavar="WORD",
-        help=f"secret of the link; better set {TOKEN}, since all users of a machine see its command lines",
+        help=f"secret of the link; better set {TOKEN}, since all users of a machine can see its command lines",
     )
 
 
@@ -72,8 +72,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
             Replay(viewer, source, voxel_map.config)
         if "?token=" in viewer.url:
-            others = "; from another machine put this one's name for localhost" if "//localhost:" in viewer.url else ""
-            say(f"whoever has this link can look at the map{others}")
+            others = "; elsewhere, replace localhost by this machine's name" if "//localhost:" in viewer.url else ""
+            say(f"anyone with this link can view the map{others}")
         say(f"open {viewer.url} in a browser; Ctrl-C ends")
         viewer.wait()
     return {"url": viewer.url}
@@ -85,7 +85,7 @@ def silence_server_log() -> None:
 
 
 def _check_poses(recording: str) -> None:
-    """Raise StereovoxError for a map whose poses are not those of its recording."""
+    """Raise StereovoxError for a map whose poses are not its recording's own."""
     from stereovox.runs.pose_choice import GIVEN, poses_of
 
     if poses_of(recording) != GIVEN:
@@ -98,7 +98,7 @@ def _recording(arguments: Namespace, config: Config) -> Source | None:
     Raises StereovoxError for a live camera.
     """
     if arguments.recording is None:
-        refuse_options(arguments, ("frames",), "picks frames of --recording, which is not given")
+        refuse_options(arguments, ("frames",), "selects frames of --recording, which is not given")
         return None
     from stereovox.opening import open_source
     from stereovox.products.moved import level_transform

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
 
-RECORDING is what `map` takes, a pattern ('drives/*'), a list (@drives.txt: a recording in each line, and the file of
-its corrected poses if there is one, from where the list is) or an s3:// prefix. The map does not depend on workers or
-boxes. What is done stays: --resume does what is missing, and what other recordings or poses change.
+RECORDING is a source as for `map`, a pattern ('drives/*'), a list (@drives.txt: one recording per line, followed by the
+file of its corrected poses, if any; paths start at the list's folder) or an s3:// prefix. The map does not depend on
+workers or boxes. Finished work is kept: --resume does the rest, and redoes what new recordings or poses change.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default: as before, or default)")
     add_usual(parser, "voxel-size", "max-range")
     parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 or 512 cells, by reach)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
-    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")
-    parser.add_argument("--resume", action="store_true", help="go on with the map at --out, for these recordings")
-    parser.add_argument("--plan", action="store_true", help="say what it will cost, and do nothing")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one per core)")
+    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) instead of these")
+    parser.add_argument("--resume", action="store_true", help="continue the map at --out, with these recordings")
+    parser.add_argument("--plan", action="store_true", help="estimate the cost, and do nothing")
     add_settings(parser, "sensor.model=andert")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Map the recordings and print what each gave."""
+    """Map the recordings and print the result of each."""
     from stereovox.fleet import map_fleet, plan_fleet
 
     settings = {"profile": arguments.profile, "box_m": arguments.box, **overrides(arguments)}
     say_about_compiling()
     if arguments.plan:
-        with progress_of_steps("looking at recordings") as progress:
+        with progress_of_steps("reading recordings") as progress:
             plan = plan_fleet(arguments.recordings, progress=progress, **settings)
         _say_plan(plan)
         return plan.summary()
@@ -70,7 +70,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _say_plan(plan: FleetPlan) -> None:
     say(f"{many(plan.frames, 'frame')} of {many(plan.recordings, 'recording')}")
-    say(f"at least {_boxes(plan.boxes)} of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
+    say(f"at least {_boxes(plan.boxes)} of {plan.box_m:g} m; each frame is in {plan.overlap:.1f} of them on average")
     say(f"{size(plan.bytes)} of depth images to keep; {_time(plan.core_hours)} of a core like one of this machine")
     for line in plan.unreadable:
         say(f"cannot be read: {line}")
@@ -81,7 +81,7 @@ def _boxes(number: int) -> str:
 
 
 def _time(hours: float) -> str:
-    """Say how long, in the unit that has figures before the point."""
+    """Format a time in the largest unit that keeps it at 1 or more."""
     if hours < 1 / 60:
         return f"{3600 * hours:.2g} s"
     return f"{60 * hours:.2g} minutes" if hours < 1 else f"{hours:.2g} hours"
@@ -91,7 +91,7 @@ def _say_map(made: FleetMap) -> None:
     boxes, mapped = made.boxes
     for one in made.recordings:
         if one.error:
-            say(f"left out: {one.recording}: {one.error}")
+            say(f"skipped: {one.recording}: {one.error}")
     refused = [one for one in made.recordings if one.refused]
     for one in refused[:SHOWN]:
         why = ", ".join(f"{number} x {reason}" for reason, number in one.refused.items())
@@ -99,6 +99,6 @@ def _say_map(made: FleetMap) -> None:
     if len(refused) > SHOWN:
         say(f"and {many(len(refused) - SHOWN, 'recording')} more with refused frames (--json)")
     frames, were = many(made.map.frames, "frame"), "was" if mapped == 1 else "were"
-    say(f"{frames}, each in {made.overlap:.1f} of {_boxes(boxes)}, {mapped} of which {were} mapped now")
+    say(f"{frames}, each in {made.overlap:.1f} of {_boxes(boxes)} on average; {mapped} of these {were} mapped now")
     say(cells_line({**made.map.counts(), "memory_bytes": made.map.memory_bytes}))
     say(f"saved in {made.out}{but_few(made.summary())}; look at it with: {command_line('view', made.out)}")

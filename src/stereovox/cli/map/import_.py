@@ -4,8 +4,8 @@
 .bt, .ot and .graph of OctoMap; .npz of stereovox; clouds and meshes (.ply, .pcd, .las, .laz, .xyz, .csv, .txt, .asc,
 .pts, .bin of KITTI, .stl, .obj, .off): each cell that holds a point or a piece of surface becomes occupied; .bag,
 .mcap, .db3 and rosbag2 folders with an octomap_msgs/Octomap or a PointCloud2; .yaml of map_server with --heights. The
-size of cells is suggested if it is not given. Where MAP ends in .yaml, .pgm or .png, FILE is a floor's map, or a
-bag with a nav_msgs/OccupancyGrid, and is saved as map_server files.
+size of cells is suggested if it is not given. If MAP ends in .yaml, .pgm or .png, FILE is a floor map, or a bag with a
+nav_msgs/OccupancyGrid, and is saved as map_server files.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 EXAMPLES = """stereovox import building.bt building.svox
 stereovox import scan.las scan.svox --voxel-size 0.1"""
 SUFFIXES_2D = (".yaml", ".yml", ".pgm", ".png", ".bmp")
-"""Suffixes of floors' maps."""
+"""Suffixes of floor maps."""
 SUFFIXES_BAG = (".bag", ".mcap", ".db3", "")
 """Suffixes of bags, which may hold both; none for a folder."""
 CLOUD_OPTIONS = ("voxel_size", "unit", "origin")
@@ -39,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--voxel-size", type=float, metavar="M", help="side of a cell in metres (suggested by points)")
     parser.add_argument("--unit", metavar="U", help="unit of points: m, cm, mm, ft or us-ft (the file's own, else m)")
     parser.add_argument("--origin", metavar="X,Y,Z", help="point of the file, in metres, that becomes the map's origin")
-    parser.add_argument("--heights", metavar="LO:HI", help="metres between which the walls of a floor's map stand")
+    parser.add_argument("--heights", metavar="LO:HI", help="lowest and highest metres of the walls of a floor map")
     parser.add_argument("--topic", metavar="T", help="topic in the bag, if there are several")
 
 
@@ -74,9 +74,9 @@ def _import_grid(arguments: Namespace) -> dict[str, Any]:
     ending = Path(arguments.file).suffix.lower()
     if ending not in (*SUFFIXES_2D, *SUFFIXES_BAG) and not Path(arguments.file).is_dir():
         raise StereovoxError(
-            f"{arguments.file}: holds a map in space; import it as M.svox, then: stereovox export M.svox floor.yaml"
+            f"{arguments.file}: holds a 3-D map; import it as M.svox, then: stereovox export M.svox floor.yaml"
         )
-    refuse_options(arguments, [*CLOUD_OPTIONS, "heights"], "a floor's map reports how large its cells are")
+    refuse_options(arguments, [*CLOUD_OPTIONS, "heights"], "a floor map defines its own cells")
     grid, mode = _read_floor(arguments) if ending in SUFFIXES_2D else _read_bag(arguments)
     write_map_server(grid, arguments.map, mode)
     rows, columns = grid.cells.shape
@@ -91,10 +91,10 @@ def _read_bag(arguments: Namespace) -> tuple[OccupancyGrid, str]:
 
 
 def _read_floor(arguments: Namespace) -> tuple[OccupancyGrid, str]:
-    """Return a floor's map and the mode it is to be written in: its own, so that no value is lost."""
-    from stereovox.formats.map_server import metadata_of
+    """Return a floor map and the mode to write it in: its own, so that no value is lost."""
+    from stereovox.formats.map_server import metadata_of, read_map_server
 
-    refuse_options(arguments, ["topic"], "a floor's map has no topics")
+    refuse_options(arguments, ["topic"], "a floor map has no topics")
     metadata = metadata_of(arguments.file)
     check_new_floor(arguments.map, arguments.file, metadata.image)
     return open_grid(arguments.file), metadata.mode

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map cameras that are connected now, with poses as they come.
+"""Map live cameras, with poses as they arrive.
 
 SOURCE is a camera (realsense: or realsense:SERIAL), a file of several (live.toml), or a recording or simulation, which
-is played at its own pace as if it were a camera. Poses come from the images themselves, a T265, or another program
-that sends lines 'stamp tx ty tz qx qy qz qw'. Ctrl-C ends and saves.
+is played at its own pace like a camera. Poses come from visual odometry, a T265, or another program that sends lines
+'stamp tx ty tz qx qy qz qw'. Ctrl-C ends and saves.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--mount", metavar="X,Y,Z,ROLL,PITCH,YAW",
-        help="where the camera is on the body (x forward, y left, z up): metres and degrees (at its origin, ahead)",
+        help="pose of the camera on the body (x forward, y left, z up): metres and degrees (at its origin, ahead)",
     )  # fmt: skip
     parser.add_argument(
         "--clock-offset", type=float, metavar="S", help="image stamp minus the stamp of a pose at that moment (0)"
@@ -79,8 +79,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--heights", metavar="LO:HI", help="metres above the floor that a robot occupies (scan.heights)"
     )
-    parser.add_argument("--sphere", metavar="FILE.png", help="picture of the distances all round, at the end")
-    parser.add_argument("--record", metavar="FILE.mcap", help="record depth images and poses beside (.bag, .db3)")
+    parser.add_argument("--sphere", metavar="FILE.png", help="picture of the distances in all directions, at the end")
+    parser.add_argument("--record", metavar="FILE.mcap", help="also record depth images and poses (.bag, .db3)")
     parser.add_argument(
         "--view", type=int, nargs="?", const=PORT, metavar="PORT",
         help=f"show the map in a browser while it grows ({PORT}; 0: any free port)",
@@ -141,7 +141,7 @@ def _rules(arguments: Namespace) -> SectorRules | None:
 
 
 def _cameras(arguments: Namespace) -> str | LiveCamera:
-    """Return the cameras; raises StereovoxError for a mount next to a file of several."""
+    """Return the cameras; raises StereovoxError for a mount together with a file of several."""
     from stereovox.live.rig import LiveCamera, mount_of
 
     if arguments.mount is None and arguments.clock_offset is None:
@@ -166,17 +166,17 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
     for name, counts in live["cameras"].items():
         lost = f"{counts['dropped']} dropped"
         early = f", {counts['before_first_pose']} before the first pose" if counts["before_first_pose"] else ""
-        slow = f", {counts['late']} of them late: it cannot be played at its pace" if counts.get("late") else ""
+        slow = f", {counts['late']} late, since it cannot be played at its pace" if counts.get("late") else ""
         failed = f"; failed: {counts['failure']}" if "failure" in counts else ""
-        say(f"  {name}: {counts['received']} images came, {lost}{early}{slow}{failed}")
+        say(f"  {name}: {counts['received']} images received, {lost}{early}{slow}{failed}")
     if "poses" in live:
         say(f"poses of {result['poses']}: {', '.join(f'{count} {what}' for what, count in live['poses'].items())}")
     latency = live["latency_ms"]
     say(f"from {latency['since']} of an image to the map: {milliseconds(latency['map'])}")
-    say(f"and until the outputs have it: {milliseconds(latency['outputs'])}")
+    say(f"and to the outputs: {milliseconds(latency['outputs'])}")
     say(f"{100 * live['cpu_share']:.0f} % of a core for {live['seconds']:.1f} s")
     failures = result.get("not_written", ())
-    for what, file in (("2-D map", arguments.grid), ("distances all round", arguments.sphere)):
+    for what, file in (("2-D map", arguments.grid), ("distances in all directions", arguments.sphere)):
         if file and not any(why.startswith(f"{file}:") for why in failures):
             say(f"{what}: {file}")
     if "obstacle_distances" in live:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stereovox.localize.track import Track
 
 TEXT, BAGS = (".tum", ".txt"), (".bag", ".mcap", ".db3")
-EXAMPLES = """stereovox localize floor.bag reference.yaml --out way.tum
+EXAMPLES = """stereovox localize floor.bag reference.yaml --out robot.tum
 stereovox localize floor.bag reference.yaml --start 1,2,90 --out path.tum --json"""
 
 
@@ -44,7 +44,7 @@ def add_start(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Localise, save the trajectory and print where it ends."""
+    """Localise, save the trajectory and print its end."""
     from stereovox.evaluate.summary import mostly_lost
     from stereovox.localize.robot_track import check_start, fit_of, localise_robot, parse_start, refused_line
 
@@ -62,7 +62,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     x, y, yaw = track.pose_map_base[-1]
     count, lost = len(track.stamps_ns), sum(track.refused.values())
     doubts = mostly_lost(count, count + lost, "scans", "have poses")
-    say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
+    say(f"last pose of the robot: x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
     refused = {"scans_refused": lost, "refused": dict(track.refused), **({"doubts": doubts} if doubts else {})}
     say(f"{count} poses saved in {out}{but_few(refused)}")
     found = {"poses": count, "last": [x, y, float(np.degrees(yaw))], "fit": fit}

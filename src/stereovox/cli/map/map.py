@@ -2,9 +2,9 @@
 """Map a recording, a simulation or a live camera.
 
 SOURCE is a folder or file with depth images or stereo pairs and poses, recognised by its content (`stereovox info`
-says what it holds, docs/recordings.md what is known), the simulation sim:room, or a connected camera, realsense:. Which
-way is up, the range and the cell size follow from the recording if no option or profile gives them. Under
-a profile of two dimensions (ist2019) it is the recording of a ground robot, as for `stereovox grid`.
+describes it, docs/recordings.md lists the formats), the simulation sim:room, or a connected camera, realsense:. Unless
+an option or profile gives them, the up direction, the range and the cell size follow from a survey of the recording.
+Under a 2-D profile (ist2019) it is the recording of a ground robot, as for `stereovox grid`.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         metavar="WHICH",
-        help="given: those of the recording (default, if there are any); track: found from the images "
+        help="given: those of the recording (default, if there are any); track: visual odometry from the images "
         "alone; both: given ones, corrected by the images",
     )
     parser.add_argument(
         "--close-loops", action="store_true",
-        help="keep the frames, and at the end bend the camera's way so that places which it saw again are one",
+        help="keep the frames, and at the end correct the camera's path so that revisited places coincide",
     )  # fmt: skip
     parser.add_argument(
-        "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
+        "--level", action="store_true", help="turn the recording's world so that z points up and layers are level"
     )
     add_usual(parser, "threads")
     parser.add_argument(
@@ -75,7 +75,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="continue the map at --out; the frames of SOURCE that it has already seen are skipped",
+        help="continue the map at --out; frames of SOURCE that it has already seen are skipped",
     )
     add_checkpoint(parser)
     parser.add_argument(
@@ -87,7 +87,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help=f"show the map in a browser while it grows, and afterwards until Ctrl-C ({PORT}; 0: any free port)",
     )
     parser.add_argument(
-        "--rerun", metavar="FILE.rrd", help="write depth images, camera and the growing map for the Rerun viewer"
+        "--rerun", metavar="FILE.rrd", help="also write depth images, camera and growing map for the Rerun viewer"
     )
 
 
@@ -103,12 +103,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _usual_out(arguments: Namespace, ending: str) -> str:
-    """Return the name of the map if none is given; raises StereovoxError if that would replace something."""
+    """Return the default name of the map; raises StereovoxError if that would replace something."""
     from stereovox.descriptions.description import map_name
 
     out = map_name(arguments.source, ending)
     if Path(out).exists() and not arguments.resume:
-        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
+        raise StereovoxError(f"{out}: already exists; replace it with --out {shlex.quote(out)}, or give another name")
     return out
 
 
@@ -129,7 +129,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
 
 def _is_floor_map(arguments: Namespace) -> bool:
-    """Return whether the settings are for the 2-D map of a ground robot, as those of profile ist2019."""
+    """Return whether the settings are for the 2-D map of a ground robot, as in profile ist2019."""
     from stereovox.cli.robot_options import settings_of
 
     return settings_of(arguments).dimensions == 2
@@ -141,7 +141,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
 
     for option in ("camera", "close_loops", "device", "integrator", "level", "poses", "threads", "view", "rerun"):
         if getattr(arguments, option) not in (None, False):
-            raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
+            raise StereovoxError(f"--{option}: does not apply to a floor map; leave it out")
     return run_floor(arguments)
 
 
@@ -157,7 +157,7 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
     if mapped.imu:
         say(f"note: {mapped.imu}")
     if result.get("dropped"):
-        say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
+        say(f"  {result['dropped']} more were dropped because the map was busy; see --set deadline_ms=")
     if reduced := [f"{number} {quality}" for quality, number in result["quality"].items() if quality != FULL]:
         say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
@@ -174,18 +174,18 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
 
 
 def _poses_line(mapped: MapResult[VoxelMap]) -> str:
-    """Return which poses were used, and how many frames were tracked."""
+    """Return a line about the poses that were used, and the number of tracked frames."""
     if mapped.poses == "given":
-        return "poses: those of the recording"
+        return "poses: from the recording"
     lost, how = sum(map(len, mapped.lost)), "tracked" if mapped.poses == "track" else "corrected by the images"
-    believed = f"; {mapped.believed} as they were, since nothing known was in view" if mapped.believed else ""
+    believed = f"; {mapped.believed} uncorrected, since nothing known was in view" if mapped.believed else ""
     return f"poses: {how}, {len(mapped.reports) - lost} of {len(mapped.reports)} frames{believed}"
 
 
 def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:
     """Return the likely reason for a map without an occupied cell."""
     if window.centre is not None and not result["free"] + result["tentative"]:
-        return "no cell is known; the camera never was in the box of window.centre and window.size"
+        return "no cell is known; the camera was never in the box of window.centre and window.size"
     if result["tentative"]:
         tentative = thousands(result["tentative"])
         return f"no cell is occupied, but {tentative} are tentative; is --max-range large enough, map.prior too low?"

@@ -2,7 +2,7 @@
 """Make a floor map from a robot's lidar and odometry by SLAM.
 
 Scans are matched, loops closed, and trajectory and map optimised together. The trajectory is saved next to the map
-(`.tum`). A map that its own scans speak against is written too, with warnings and exit status 3.
+(`.tum`). A map that its own scans contradict is written too, with warnings and exit status 3.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _print_result(robot: Robot, found: SlamResult, seconds: float, compiling: bo
 
 
 def _pace(recorded: float, seconds: float, compiling: bool) -> str:
-    """Say how much faster than the robot drove; nothing of a recording whose stamps stand still."""
+    """Return the speed as a multiple of the robot's; "" for a recording whose stamps do not advance."""
     times = recorded / seconds if seconds > 0 else 0.0
     if times < 0.05:
         return ""

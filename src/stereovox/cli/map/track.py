@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the poses of a camera from its own depth images or stereo pairs.
 
-SOURCE is what `map` takes, with or without poses; those that it has are only compared with. The poses are those that
-`map --poses track` uses. Frames in which the camera was lost have none, and exit status 3 says that there are some.
+SOURCE is as for `map`, with or without poses; its own poses serve only for comparison. The poses are the same as with
+`map --poses track`. Frames in which tracking was lost have no pose; if there are any, the exit status is 3.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore
 
 ALIKE = ("profile", "max_range", "frames", "camera")
-"""Options that `map` has, too, and that poses depend on."""
-EXAMPLES = """stereovox track recordings/kitchen --out way.tum
+"""Options that `map` has too, and that affect poses."""
+EXAMPLES = """stereovox track recordings/kitchen --out kitchen.tum
 stereovox track recordings/kitchen --frames :300 --out start.tum"""
 
 
@@ -28,7 +28,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", required=True, metavar="FILE", help="poses to write: .tum or .txt, lines 'stamp tx ty tz qx qy qz qw'"
     )
-    about = "the path from above, where the camera was lost, and errors if the recording has poses"
+    about = "the path from above, gaps in tracking, and errors if the recording has poses"
     parser.add_argument("--picture", metavar="FILE.png", help=about)
     add_usual(parser, "profile", "max-range", "frames", "camera")
     add_settings(parser, "noise.subpixel=0.1")
@@ -47,8 +47,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         options = options_of(TrackOptions, arguments)
         found = track_recording(arguments.source, arguments.out, progress=progress, **options)
     result = found.summary()
-    median = f"{result['frame_ms']['median']:.3g} ms a frame (median)"
-    say(f"{result['tracked']} of {result['frames']} frames tracked, a way of {result['length_m']:.2f} m, {median}")
+    median = f"{result['frame_ms']['median']:.3g} ms per frame (median)"
+    say(f"{result['tracked']} of {result['frames']} frames tracked over {result['length_m']:.2f} m, {median}")
     say_lost(found.lost)
     if found.score is not None:
         say(_score_line(found.score))
@@ -68,6 +68,6 @@ def _map_line(arguments: Namespace) -> str:
 
 
 def _score_line(score: TrajectoryScore) -> str:
-    drift = "" if score.drift_percent is None else f"; the end is off by {score.drift_percent:.2g} % of the way"
+    drift = "" if score.drift_percent is None else f"; the end is off by {score.drift_percent:.2g} % of the length"
     off = f"positions are off by {100 * score.position_m.rmse:.2g} cm (RMS)"
     return f"aligned with the recording's own poses, {off}{drift}"

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a map with the ground truth, cell by cell: first what it decides, then its probabilities; or trajectories.
+"""Compare a map with the ground truth, cell by cell: first its decisions, then its probabilities; or trajectories.
 
 MAP and TRUTH are stereovox folders or OctoMap files (.bt, .ot) with cells of the same size; or both are floor maps
 in map_server files (.yaml), of any cell size, which are aligned first; or both are files of poses (TUM lines, KITTI's
-12 numbers), of which TRUTH has the true ones.
+12 numbers), with the true ones in TRUTH.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ DIFFERENCES = {
     "extra": "known to the map only",
 }
 POSE_ENDINGS = (".tum", ".txt", ".csv", ".kitti", ".freiburg", ".log", ".json", ".npy")
-"""Files with these are trajectories."""
+"""Suffixes of trajectories."""
 ALIKE = 0.3
-"""IoU of walls within a cell below which two maps may be of different places."""
+"""IoU of walls within a cell below which two maps may show different places."""
 TOLERANCE = 1
-"""Cells of `--tolerance`, if it is not given."""
+"""Default of `--tolerance`, in cells."""
 EXAMPLES = """stereovox eval drive.svox truth.svox --report drive-report
 stereovox eval estimated.tum reference.tum --json"""
 MEASURES = {
@@ -44,7 +44,7 @@ MEASURES = {
     "recall": "of the surface cells, are called occupied",
     "tolerance_precision": "precision, a surface within {} is enough",
     "tolerance_recall": "recall, an occupied cell within {} is enough",
-    "accuracy": "of all cells, are called right",
+    "accuracy": "of all cells, are classified correctly",
     "specificity": "of the free cells, are not called occupied",
     "npv": "of the cells not called occupied, are free",
     "iou": "intersection over union: tp / (tp + fp + fn)",
@@ -60,9 +60,9 @@ F_SCORES = {
 }
 SINGLE = {
     "error": "mean squared error of the probabilities (Brier score), 0 is perfect",
-    "ece": "how far probabilities lie from the true shares (ECE), 0 is perfect",
+    "ece": "how far probabilities are from the true shares (ECE), 0 is perfect",
     "ece_likely": "the same over cells with p >= 0.3",
-    "ece_equal_mass": "the same in bins of equally many cells",
+    "ece_equal_mass": "the same in bins with equal numbers of cells",
 }
 
 
@@ -84,10 +84,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     both = parser.add_argument_group("floor maps and trajectories")
     both.add_argument("--no-align", action="store_true", help="MAP and TRUTH share a frame: do not align MAP")
     poses = parser.add_argument_group("trajectories")
-    about = "both from above, where the estimate has no pose, and errors along the way and by length"
+    about = "both from above, gaps of the estimate, and errors along the path and by length"
     poses.add_argument("--picture", metavar="FILE.png", help=about)
-    poses.add_argument("--scale", action="store_true", help="fit the scale, too, as for one camera without metres")
-    about = "poses further apart in time are no pair (default: 0.02; not for poses without times)"
+    poses.add_argument("--scale", action="store_true", help="fit the scale too, as for a single camera without scale")
+    about = "poses farther apart in time are no pair (default: 0.02; not for poses without times)"
     poses.add_argument("--max-difference", type=float, metavar="S", help=about)
     about = (
         "length of a segment for errors by distance; repeatable (default: 100 to 800 m as KITTI, for trajectories of "
@@ -104,14 +104,14 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if len(poses) == 2:
         return _compare_trajectories(arguments)
     if poses:
-        raise StereovoxError(f"{poses[0]}: a file of poses, the other one is none; give two maps or two files of poses")
+        raise StereovoxError(f"{poses[0]}: a file of poses, but the other is not; give two maps or two files of poses")
     refuse_options(arguments, ("scale", "max_difference", "segment", "picture"), "only for trajectories")
     kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
     if len(kinds) == 2:
         space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
         command = ("export", space) if is_map(space) else ("grid", space, "--out")
         cure = command_line(*command, "floor.yaml")
-        raise StereovoxError(f"{space}: no floor's map, the other one is; make one of it with: {cure}")
+        raise StereovoxError(f"{space}: is no floor map, but the other is; make one from it with: {cure}")
     return COMPARE[kinds.pop()](arguments)
 
 
@@ -127,7 +127,7 @@ def region(text: str) -> tuple[float, ...]:
 
 
 def _holds_poses(path: str) -> bool:
-    """Return whether a name is that of a file of poses, not of a map."""
+    """Return whether a path names a file of poses, not a map."""
     return Path(path).suffix.lower() in POSE_ENDINGS and not Path(path).is_dir()
 
 
@@ -152,7 +152,7 @@ def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
     if score.segments:
         say_table(report.SEGMENT_HEADS, report.segment_rows(score))
     if score.drift_percent is not None:
-        say(f"drift: laid on each other at the start, the ends are {score.drift_percent:.3f} % of the length apart")
+        say(f"drift: aligned at the start, the ends are {score.drift_percent:.3f} % of the length apart")
     for note in report.notes(score):
         say(note)
     if arguments.picture:
@@ -173,7 +173,7 @@ def _compare_grids(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.grids.grid_scores import laid_on, score_laid
     from stereovox.evaluate.truth_cells import level
 
-    refuse_options(arguments, ("path",), "distances from a camera are not for floors' maps")
+    refuse_options(arguments, ("path",), "distances from a camera do not apply to floor maps")
     if arguments.threshold is not None:
         level(arguments.threshold)
     reference, grid = open_grid(arguments.truth), open_grid(arguments.map)
@@ -200,8 +200,8 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.scores import score
     from stereovox.evaluate.truth_cells import TruthCells, level
 
-    refuse_options(arguments, ("exclude",), "only for floors' maps (.yaml)")
-    refuse_options(arguments, ("no_align",), "only for floors' maps (.yaml) and trajectories")
+    refuse_options(arguments, ("exclude",), "only for floor maps (.yaml)")
+    refuse_options(arguments, ("no_align",), "only for floor maps (.yaml) and trajectories")
     threshold = 0.7 if arguments.threshold is None else arguments.threshold
     level(threshold)  # raises for a bad threshold before large maps are read
     path = None if arguments.path is None else read_camera_path(arguments.path)
@@ -214,7 +214,7 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
     _print_decisions(scores)
     _print_scores(scores)
     if path is not None and not path_fits(path, truth, voxel_map.config.max_range):
-        say("the path does not fit the map: is it in the map's world frame?")
+        say("the path does not fit the map; is it in the map's world frame?")
     if arguments.report:
         from stereovox.view.report.evaluation import Evaluated, write_evaluation_report
 
@@ -245,7 +245,7 @@ def _print_scores(scores: Scores) -> None:
     observed = scores.observed
     say(f"{thousands(scores.cells)} cells of the truth, {scores.coverage:.1%} of them observed by the map")
     if not observed.cells:
-        say("the map knows none of them: are both in the same world frame?")
+        say("the map knows none of these; are both in the same world frame?")
     say(f"occupied: p > {scores.threshold:g}")
     say(f"{'':20}  {'all cells':>11}  {'observed':>11}")
     for name in ("tp", "fp", "tn", "fn"):
@@ -270,20 +270,20 @@ def _print_grid_scores(scores: GridScores, regions: int) -> None:
     errors = scores.errors
     x, y, yaw = scores.motion
     if scores.aligned:
-        say(f"the map was moved by {x:.3f}, {y:.3f} m and {np.degrees(yaw):.2f} degrees to lie on the reference")
-    say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): cells that differ, for 100 known to the reference")
+        say(f"the map was aligned with the reference by {x:.3f}, {y:.3f} m and {np.degrees(yaw):.2f} degrees")
+    say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): cells that differ, per 100 known to the reference")
     say(f"  of it {errors.eq7_coverage_percent:.2f} % coverage (only one map knows the cell) and "
         f"{errors.eq7_contradiction_percent:.2f} % contradiction (free in one, occupied in the other)")  # fmt: skip
     for kind, what in DIFFERENCES.items():
         say(f"{thousands(getattr(errors, kind)):>11} {kind.replace('_', ' ')}: {what}")
     if regions:
-        say(f"excluded: {thousands(errors.excluded)} cells, of which {thousands(errors.forgiven)} differ; with them "
-            f"out of the number below too the error is {_percent(errors.eq7_outside_percent)}")  # fmt: skip
+        say(f"excluded: {thousands(errors.excluded)} cells, of which {thousands(errors.forgiven)} differ; without them "
+            f"in the denominator too, the error is {_percent(errors.eq7_outside_percent)}")  # fmt: skip
     if regions and not errors.excluded:
-        say("no cell lies in an excluded region: are they in metres, in the reference's frame?")
+        say("no cell is in an excluded region; are the regions in metres, in the reference's frame?")
     say(f"of the {thousands(errors.known_in_both)} cells known to both {_percent(errors.known_error_percent)} differ")
     if not errors.known_in_both:
-        say("the maps have no known cell in common: leave --no-align out, or are they of one place?")
+        say("the maps have no known cell in common; leave --no-align out, or check that they show one place")
     walls, within = scores.occupied, f"{scores.tolerance_cells} cell" + ("" if scores.tolerance_cells == 1 else "s")
     say(f"walls: IoU {_number(walls.iou)}, within {within} {_number(walls.iou_tolerant)} (precision "
         f"{_number(walls.tolerance_precision)}, recall {_number(walls.tolerance_recall)})")  # fmt: skip
@@ -292,7 +292,7 @@ def _print_grid_scores(scores: GridScores, regions: int) -> None:
             say(f"walls, {what}: mean {figures.mean:.3f}, median {figures.median:.3f}, 95 % {figures.p95:.3f} m")
     say(f"free cells: IoU {_number(scores.free_iou)}; the map knows {_number(scores.coverage)} of the reference")
     if walls.iou_tolerant is not None and walls.iou_tolerant < ALIKE:
-        say("note: their walls hardly match: are they of one place? --report DIR shows both")
+        say("note: their walls hardly match; do they show the same place? --report DIR shows both")
 
 
 def _percent(value: float | None) -> str:

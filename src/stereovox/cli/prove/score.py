@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map many recordings with lidars one by one, and score each map against its own truth: a table.
+"""Map many recordings with lidars one by one, score each map against its own truth, and print a table.
 
 RECORDING is a KITTI recording with lidar, a pattern ('training/image_02/*'), a list (@drives.txt) or an s3:// prefix.
-The table is Valenti 2018, Table 8.1, for any number of recordings and profiles. What is done stays: --resume scores
-only what is missing.
+The table is Valenti 2018, Table 8.1, for any number of recordings and profiles. Finished scores are kept: --resume adds
+the missing ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder or s3:// URL for scores.csv and scores.json"
     )
-    about = "profile name or TOML file; repeatable, to compare them (default, cells and range as suggested)"
+    about = "profile name or TOML file; repeatable, to compare profiles (default, with suggested cells and range)"
     parser.add_argument("--profile", action="append", metavar="P", help=about)
     add_usual(parser, "voxel-size", "max-range")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames of each recording, as a Python slice")
@@ -37,15 +37,16 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--free",
         choices=("view", "rays"),
         default="view",
-        help="cells free in truth: all others in view of a frame (view), or only those that a lidar ray crosses (rays)",
+        help="free cells of the truth: all others in view of a frame (view), or only those that a lidar ray "
+        "crosses (rays)",
     )
     parser.add_argument(
         "--threshold", type=float, default=0.7, metavar="P", help="a cell is called occupied above (0.7)"
     )
     parser.add_argument("--tolerance", type=int, default=1, metavar="CELLS", help="distance that counts as a match (1)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
-    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")
-    parser.add_argument("--resume", action="store_true", help="go on with the scores at --out")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one per core)")
+    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) instead of these")
+    parser.add_argument("--resume", action="store_true", help="continue the scores at --out")
     add_settings(parser, "sensor.model=andert")
 
 
@@ -63,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         )  # fmt: skip
     for one in scores.scored:
         if one.error:
-            say(f"left out: {one.recording}: {one.error}")
+            say(f"skipped: {one.recording}: {one.error}")
     table = scores.table()
     names = _short([row["recording"] for row in table])
     say_table(SHOWN, [[_cell({**row, "recording": names[row["recording"]]}[name]) for name in SHOWN] for row in table])
@@ -72,7 +73,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _short(recordings: Sequence[str]) -> dict[str, str]:
-    """Return a name for each recording that fits into a table: its last part, where that tells them apart."""
+    """Return a name for each recording that fits into a table: its last part, if these differ."""
     lasts = {one: one.rstrip("/").rpartition("/")[2] for one in recordings}
     return lasts if len(set(lasts.values())) == len(lasts) else {one: one for one in recordings}
 

@@ -2,7 +2,7 @@
 """Make a ground-truth map from a recording's lidar.
 
 SOURCE is a KITTI recording with lidar: a raw drive, a tracking or odometry sequence, or stereo 2015 scenes. A cell is
-occupied where at least one lidar point in it is inside the left image and in no annotated box.
+occupied if at least one lidar point in it is inside the left image and in no annotated box.
 """
 
 from __future__ import annotations
@@ -40,11 +40,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--free",
         choices=("view", "rays", "box"),
         default="view",
-        help="free cells: all others in view of a frame (view), only those of them that a lidar ray crosses (rays), or "
-        "all others of the box round them (box: Valenti 2018, Table 8.1)",
+        help="free cells: all others in view of a frame (view), or only those that a lidar ray crosses (rays)",
     )
     parser.add_argument(
-        "--box-margin", type=float, default=0.0, metavar="M", help="metres by which annotated boxes are enlarged (0)"
+        "--box-margin", type=float, default=0.0, metavar="M", help="enlarge annotated boxes by this many metres (0)"
     )
 
 
@@ -74,7 +73,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _with_progress(numbers: Iterable[int], count: int) -> Iterator[int]:
-    """Yield the frame numbers with a progress bar; Ctrl-C stops between two."""
+    """Yield the frame numbers with a progress bar; Ctrl-C stops between two frames."""
     from stereovox.runs.engine import interrupt_between_steps
 
     with interrupt_between_steps() as check:
@@ -89,7 +88,7 @@ def _print_result(counts: TruthCounts, memory_bytes: int, out: Path) -> None:
         say(f"  {number} x {reason}")
     if counts.first_refusal:
         say(f"  first: {counts.first_refusal}")
-    far = f"{thousands(counts.out_of_range)} of them from beyond the range of their own frame"
+    far = f"{thousands(counts.out_of_range)} of them beyond the range of their own frame"
     say(f"{thousands(counts.used)} of {thousands(counts.points)} points used, {far}; dropped:")
     for name, text in DROPPED.items():
         say(f"  {thousands(getattr(counts, name)):>11} {text}")

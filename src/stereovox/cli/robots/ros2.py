@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map live ROS 2 topics.
 
-Depth images with camera_info, point clouds and laser scans in, poses from /tf or odometry; a 2-D map, a cloud, an
-OctoMap and diagnostics out. All options and settings can also be given as parameters: docs/ros2.md.
+Input: depth images with camera_info, point clouds and laser scans, poses from /tf or odometry. Output: a 2-D map, a
+cloud, an OctoMap and diagnostics. All options and settings can also be given as parameters: docs/ros2.md.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     for name, value, about in topics:
         parser.add_argument(f"--{name}", action="append", metavar=value, help=f"{about}; repeatable")
     about = (
-        "given: those of /tf and the options above; track: of the first depth camera, by its own images; slam, or the "
-        "MAP.yaml that the robot is localised in, by its lidar (given)"
+        "given: from /tf and the options above; track: from the first depth camera by visual odometry; slam, or a "
+        "MAP.yaml to localise the robot in, by its lidar (given)"
     )
     parser.add_argument("--poses", metavar="HOW", help=about)
-    parser.add_argument("--lidar", metavar="TOPIC", help="laser scans that tell where the robot is (the first --scan)")
+    parser.add_argument("--lidar", metavar="TOPIC", help="laser scans that localise the robot (the first --scan)")
     parser.add_argument("--start", metavar="X,Y,DEG", help="first pose of the robot in MAP.yaml: metres and degrees")
     parser.add_argument("--slam-out", metavar="MAP", help="where to save SLAM's map at the end, for example floor.yaml")
-    parser.add_argument("--reference", metavar="MAP", help="compare the 2-D map with this .yaml (that of --poses)")
+    parser.add_argument("--reference", metavar="MAP", help="compare the 2-D map with this .yaml (the one of --poses)")
     about = "region of the reference that does not count; repeatable"
     parser.add_argument("--exclude", action="append", metavar="X0,Y0,X1,Y1", help=about)
     parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
@@ -55,11 +55,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--corrected-path", metavar="TOPIC", help="correct the map by a SLAM program's nav_msgs/Path")
     parser.add_argument("--path-frame", metavar="FRAME", help="the frame whose poses these are (the first sensor's)")
     parser.add_argument(
-        "--correct-jumps", action="store_true", help="spread jumps of odom in the map over the way since the last one"
+        "--correct-jumps", action="store_true", help="spread jumps of odom in the map over the path since the last one"
     )
-    about = "write launch file, parameters and displays for Nav2 there, and end"
+    about = "write launch file, parameters and displays for Nav2 there, and exit"
     parser.add_argument("--write-nav2", metavar="FOLDER", help=about)
-    about = "Nav2's parameters to lay ours over, with --write-nav2 (those of the sourced distribution)"
+    about = "Nav2's parameters to override with ours, with --write-nav2 (the sourced distribution's)"
     parser.add_argument("--nav2-params", metavar="FILE", help=about)
     about = "start as a managed node: configure and activate it by its lifecycle services"
     parser.add_argument("--lifecycle", action="store_true", help=about)
@@ -96,7 +96,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _run_of(arguments: Namespace, node: Any) -> NodeRun:
-    """Return the run of a node, with the parameters that it has now; the command line overrides them."""
+    """Return the run of a node with its present parameters, overridden by the command line."""
     from stereovox.config import load_config
     from stereovox.ros.options import PREFIX, Options, given_parameters, with_parameters
     from stereovox.ros.run import NodeOptions, NodeRun
@@ -125,13 +125,13 @@ def _write_nav2(arguments: Namespace) -> dict[str, Any]:
 
 
 def _print_result(result: dict[str, Any], reports: Sequence[UpdateReport]) -> None:
-    """Print what became of the frames, and what localisation, SLAM and the comparison found."""
+    """Print the results of frames, localisation, SLAM and comparison."""
     say(f"{result['frames']} frames mapped, {result['frames_refused']} refused, {sum(result['dropped'].values())} late")
     for reason, number in result["refused"].items():
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
     if not all(one.refused for one in reports):
-        say(f"a frame: {milliseconds(result['frame_ms'])}")
+        say(f"per frame: {milliseconds(result['frame_ms'])}")
     if "localisation" in result:
         refused = sum(result["localisation"]["refused"].values())
         say(f"localised by {result['localisation']['scans']} scans, {refused} refused")

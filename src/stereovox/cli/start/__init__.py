@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for a first look: demo, simulate, info."""
+"""Commands to start with: demo, simulate, info."""

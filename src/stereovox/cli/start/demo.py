@@ -22,7 +22,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run the demo and print where its results are."""
+    """Run the demo and print the paths of its results."""
     from stereovox.runs.demo import demo
 
     say_about_compiling()
@@ -35,8 +35,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _print_result(result: dict[str, Any]) -> None:
     accuracy = result["accuracy"]
     parts = [f"{result[name]['median']:.2f} ms" for name in ("depth_ms", "integrate_ms")]
-    say(f"{result['frames']} frames; a frame: {milliseconds(result['frame_ms'])}")
-    say(f"medians of its parts: {parts[0]} to prepare the depth image, {parts[1]} to put it into the map")
+    say(f"{result['frames']} frames; per frame: {milliseconds(result['frame_ms'])}")
+    say(f"medians of its parts: {parts[0]} to prepare the depth image, {parts[1]} to map it")
     say(cells_line(result))
     say(
         f"against the exact scene, within one cell: precision {accuracy['tolerance_precision']:.3f}, "

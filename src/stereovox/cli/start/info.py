@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Show what a path holds and which commands use it.
 
-A map and how it was made; a recording: frames, rate, camera, depth unit, poses, which way is up; a bag: its topics; a
+A map and how it was made; a recording: frames, rate, camera, depth unit, poses, up direction; a bag: its topics; a
 robot's log; a cloud or a map of another program; a file of poses, a calibration, settings, a depth image.
 """
 

@@ -34,5 +34,5 @@ def run(arguments: Namespace) -> dict[str, Any]:
         write_bag(robot, out, lambda done, total: bar.update(task, completed=done, total=total))
     written = {"file": str(out), "scans": len(robot.scans), "frames": len(robot.frames), "bytes": out.stat().st_size}
     say(f"{written['scans']} scans and {written['frames']} depth images saved in {out} ({size(written['bytes'])})")
-    say(f"make the reference map of it with: {command_line('slam', out, '--out', 'reference.yaml')}")
+    say(f"make the reference map from it with: {command_line('slam', out, '--out', 'reference.yaml')}")
     return written

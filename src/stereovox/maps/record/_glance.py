@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels for glances: ranges binned by direction, and where the points of another glance lie among them."""
+"""Kernels for glances: bin ranges by direction, and compare the points of another glance with them."""
 
 import numpy as np
 
 from stereovox.kernels._jit import cell, kernel
 
 SIDE = 128
-"""Directions are binned in an octahedron laid flat (Meyer et al. 2010), SIDE by SIDE bins of about 1.6 degrees."""
+"""Directions are binned in an unfolded octahedron (Meyer et al. 2010), SIDE by SIDE bins of about 1.6 degrees."""
 UNSEEN, SAME, ELSEWHERE = (np.uint8(n) for n in range(3))
-"""How a point compares: nothing was seen in its direction; something was seen where it is, or it is on the surface
-through what was seen; everything was seen elsewhere."""
+"""Where a point is: in a direction without ranges; at one of them, or on the surface through them; before or behind
+all of them, or between two."""
 SURFACE = np.float32(0.3)
-"""Share of its distance by which a surface that is seen at a flat angle may extend from bin to bin."""
+"""Share of its distance by which a surface seen at a flat angle may extend from bin to bin."""
 HALF, ONE, LEAST = np.float32(0.5), np.float32(1), np.float32(1e-9)
 NONE, FAR = np.float32(0), np.float32(np.inf)
 
 
 @cell
 def _sides(x, y, z):
-    """Return the row and column of the bin of a direction; z is in the middle of the square."""
+    """Return the row and column of the bin of a direction; +z is in the middle of the square."""
     length = max(abs(x) + abs(y) + abs(z), LEAST)
     x, y = x / length, y / length
     a = (ONE - abs(y)) * (-ONE if x < NONE else ONE) if z < NONE else x
@@ -29,11 +29,11 @@ def _sides(x, y, z):
 
 @cell
 def _place(ranges, x, y, z, tolerance):
-    """Return where a point lies among `ranges`, as one of the constants above; its bin and those around it count."""
+    """Return where a point is among `ranges`, as one of the constants above; its bin and the neighbours count."""
     row, column = _sides(x, y, z)
     far = np.sqrt(x * x + y * y + z * z)
     if ranges[row, column] == NONE:
-        return UNSEEN  # at the edge of the view, those around it are on one side only
+        return UNSEEN  # at the edge of the view, the neighbours are on one side only
     nearest, farthest, least = FAR, NONE, FAR
     for v in range(max(row - 1, 0), min(row + 2, SIDE)):
         for u in range(max(column - 1, 0), min(column + 2, SIDE)):
@@ -47,7 +47,7 @@ def _place(ranges, x, y, z, tolerance):
 
 @kernel
 def bin_points(points, ranges):
-    """Write the distances of `points` (N, 3) to their bins of `ranges` (SIDE, SIDE); the last one in a bin stays."""
+    """Write the distances of `points` (N, 3) to their bins of `ranges` (SIDE, SIDE); the last one in a bin wins."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         row, column = _sides(x, y, z)
@@ -56,7 +56,7 @@ def bin_points(points, ranges):
 
 @kernel
 def place(ranges, points, T, tolerance, out):
-    """Write to `out` (N,) uint8 where points (N, 3) lie among `ranges` (SIDE, SIDE) metres, 0: nothing was seen.
+    """Write to `out` (N,) uint8 where points (N, 3) are among `ranges` (SIDE, SIDE) in metres, 0 for none.
 
     T: (3, 4) from the points' frame to that of the ranges. tolerance: (N,) metres.
     """
@@ -73,7 +73,7 @@ def place(ranges, points, T, tolerance, out):
 
 @kernel
 def bin_image(depth_m, columns, rows, first, step, reach, ranges):
-    """Write the distances of every `step`-th pixel from `first` on to their bins, if they are at most `reach` metres.
+    """Write the distance of every `step`-th pixel from `first` to its bin, if it is at most `reach` metres.
 
     depth_m: (height, width) metres. columns: (width,), rows: (height, 2) rays of the pixels.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The path of the cameras that made a map, thinned to what is worth drawing."""
+"""The path of the cameras that made a map, thinned for drawing."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stereovox.geometry.se3 import Transform, apart
 SPACING_M = 0.05
 """A pose is kept when the camera has moved this far, or turned by twice as many radians, since the last one."""
 MAX_STOPS = 2048
-"""Poses kept of all sensors together; when there are more, the spacing doubles."""
+"""Most poses kept of all sensors together; when there are more, the spacing doubles."""
 FARTHEST = 1e7
-"""Bound of all numbers of a pose; frames with positions beyond a tenth of it are refused."""
+"""Bound of all numbers of a pose; frames farther away than a tenth of it are refused."""
 POSE = 12
 """Numbers of a pose."""
 
@@ -35,8 +35,8 @@ class StampedPose(NamedTuple):
 class CameraPath:
     """Poses along the path of each sensor, in the order in which their frames entered the map.
 
-    spacing: least metres between two poses, and half the least radians. stops: poses by sensor, rounded to float32 as
-    they are saved.
+    spacing: least distance of two poses in metres, and half their least angle in radians. stops: poses by sensor,
+    rounded to float32, as they are saved.
     """
 
     spacing: float = SPACING_M
@@ -59,7 +59,7 @@ class CameraPath:
         return matrices
 
     def lines(self) -> list[NDArray[np.float64]]:
-        """Return the positions (N, 3) in metres, world frame, of each sensor that has any, in the order of frames."""
+        """Return the positions (N, 3) in metres, world frame, of each sensor that has any, in frame order."""
         return [self.poses(sensor)[:, :3, 3] for sensor, stops in self.stops.items() if stops]
 
     def until(self, stamp_ns: float = inf) -> list[tuple[str, Transform]]:
@@ -86,10 +86,10 @@ class CameraPath:
 
     @classmethod
     def loaded(cls, saved: Any) -> CameraPath:
-        """Return a saved path. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        """Return a saved path. Raises KeyError, TypeError or ValueError if the values cannot be one."""
         spacing = float(saved["spacing"])
         if not SPACING_M <= spacing < FARTHEST:
-            raise ValueError(f"camera_path: spacing {spacing:g}")
+            raise ValueError(f"camera_path: invalid spacing {spacing:g}")
         stops = {sensor: _stops_from(one) for sensor, one in saved["stops"].items()}
         if sum(map(len, stops.values())) > MAX_STOPS:
             raise ValueError(f"camera_path: more than {MAX_STOPS} poses")
@@ -117,13 +117,13 @@ def _packed(numbers: Any, dtype: str) -> str:
 
 def _unpacked(text: Any, dtype: str) -> NDArray[Any]:
     if not isinstance(text, str) or len(text) > 8 * POSE * MAX_STOPS:
-        raise ValueError("camera_path: no packed numbers")
+        raise ValueError("camera_path: not packed numbers")
     return np.frombuffer(base64.b64decode(text, validate=True), dtype)
 
 
 def _stops_from(saved: Any) -> list[StampedPose]:
     stamps, numbers = _unpacked(saved["stamps_ns"], "<i8"), _unpacked(saved["poses"], "<f4")
     if len(numbers) != POSE * len(stamps) or not (np.abs(numbers) <= FARTHEST).all():  # False for NaN
-        raise ValueError("camera_path: poses that cannot be")
+        raise ValueError("camera_path: invalid poses")
     poses = map(tuple, numbers.reshape(-1, POSE).tolist())
     return [StampedPose(stamp_ns, pose) for stamp_ns, pose in zip(stamps.tolist(), poses, strict=True)]

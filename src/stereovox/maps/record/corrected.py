@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map remembers of its sensors, after the poses of its frames were corrected."""
+"""Correct the history of a map after the poses of its frames were corrected."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from stereovox.maps.record.history import History
 def correct_history(
     history: History, before: Sequence[tuple[str, StampedPose]], after: Sequence[tuple[str, StampedPose]]
 ) -> None:
-    """Give a history the corrected poses, so that the next frames are compared with these.
+    """Give a history the corrected poses, so that the next frames are compared with them.
 
-    What a sensor's frames waited for, or were in doubt of, was the map of before: it begins anew. So do the lines of
-    loops, whose places are elsewhere now.
+    Waits and doubts of a sensor's frames referred to the old map: they are cleared. So are the lines of loops, for
+    their places have moved.
 
     before, after: sensor and pose of the frames, in the order in which they entered the map.
     """
@@ -37,14 +37,14 @@ def matrix_of(seen: StampedPose) -> Transform:
 
 
 def _correct_sensor(history: History, sensor: str, old: StampedPose, new: StampedPose) -> None:
-    """Move what is remembered of a sensor as its last frame was moved."""
+    """Move the poses remembered for a sensor as its last frame was moved."""
     T_new_old = matrix_of(new) @ inverse(matrix_of(old))
     history.waiting.pop(sensor, None)
     history.doubts.pop(sensor, None)
     history.glances.pop(sensor, None)
     if (look := history.looks.get(sensor)) is not None:
         history.looks[sensor] = look._replace(pose=_moved(look.pose, T_new_old))
-    if (trusted := history.trusted.get(sensor)) is not None:  # a merged map trusts none so far
+    if (trusted := history.trusted.get(sensor)) is not None:  # a merged map has no trusted frame yet
         later = trusted._replace(pose=_moved(trusted.pose, T_new_old))
         history.trusted[sensor] = new if trusted == old else later
 

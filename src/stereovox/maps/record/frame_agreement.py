@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Agreement of one frame with what a map is sure of."""
+"""Agreement of one frame with the sure cells of a map."""
 
 from __future__ import annotations
 
@@ -15,30 +15,31 @@ from stereovox.maps.cells.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.storage.blocks import StoredCells
 
 FEW = 200.0
-"""Log-odds on surfaces the map is sure of that are too few to judge a frame by: some 50 hits."""
+"""Least log-odds on sure cells to judge a frame by: some 50 hits."""
 FEW_BEAMS, AGAINST_BEAMS = 12, 8
-"""Beams of a scan that are; and those against the map that are enough wherever they come from."""
+"""Least beams of a scan on known cells to judge it by; and beams against the map that suffice, however little of the
+scan is known."""
 KNOWN = 0.3
-"""Share of what a frame sees that the map must be sure of."""
+"""Share of a frame's evidence that must be on sure cells."""
 SAMPLE = 512
 """Blocks that are enough to judge a frame by."""
-LOOKED_THROUGH = 3.0
-"""What is looked through tells as much as what is hit, although a sensor model gives it less evidence, and only where
-a whole patch of pixels looks through."""
+SEEN_THROUGH = 3.0
+"""Weight of a pass relative to a hit: a surface that is seen through says as much, although the sensor model gives it
+less evidence, and only if a whole patch of pixels sees through."""
 
 
 class Agreement(NamedTuple):
-    """Log-odds that a frame gives to cells the map is sure of.
+    """Log-odds that a frame gives to sure cells of the map.
 
     Hits that are not firm count for cells, but not against them.
 
-    A cell is surely free or occupied where it is past the middle between its threshold and its limit; where the frame
-    confirms an occupied cell, it need not be sure.
+    A cell is surely free or occupied if it is past the middle between its threshold and its limit; an occupied cell
+    that the frame confirms need not be sure.
 
-    hits: for cells that are occupied. passes: against cells that are surely occupied: the frame looks through them.
-    into_free: against cells that are surely free: the frame sees something there. at_edge: those of them that are next
-        to an unknown cell, where surfaces come to light that the camera saw edge on before.
-    every: all firm hits, whatever the map says of their cells.
+    hits: for occupied cells. passes: against surely occupied cells: the frame sees through them. into_free: against
+        surely free cells: the frame sees something there. at_edge: the part of into_free next to unknown cells, where
+        surfaces appear that the camera saw edge-on before.
+    every: all firm hits, whatever the state of their cells.
     """
 
     hits: float
@@ -49,21 +50,21 @@ class Agreement(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """All log-odds that say something of the map's surfaces."""
+        """All log-odds that count for or against the map."""
         return self.hits + self.through + self.into_free
 
     @property
     def through(self) -> float:
-        """What the frame looks through, as much as if it were hit."""
-        return LOOKED_THROUGH * self.passes
+        """The passes, weighted like hits."""
+        return SEEN_THROUGH * self.passes
 
     @property
     def against(self) -> float | None:
-        """Share of them that is against the map, 0 to 1; None if there are too few to tell.
+        """Share of them that is against the map, 0 to 1; None if there are too few to judge.
 
-        What is new is often seen first where noise at the end of the range has cleared some cells before; so a frame
-        is judged only where a good part of what it sees is known, or where it looks through much; and what is at the
-        edge of the known counts no more than all else that is against the map.
+        New surfaces often appear where noise at the end of the range had cleared some cells. So a frame is judged only
+        if a good part of what it sees is known, or if it sees through much; and hits at the edge of known space count
+        no more than all the rest that is against the map.
         """
         if self.weight < FEW or (self.weight < KNOWN * self.every and self.through < FEW):
             return None
@@ -73,10 +74,10 @@ class Agreement(NamedTuple):
 
 
 class BeamAgreement(NamedTuple):
-    """How many beams of a scan agree with what a grid is sure of.
+    """How many beams of a scan agree with the sure cells of a grid.
 
-    agree: end at a surface. into_free: end in what is surely free. through: clear what is surely occupied, and end at
-    nothing known. every: all that say something.
+    agree: end at a surface. into_free: end in surely free cells. through: clear surely occupied cells, and end at
+    nothing known. every: all that carry evidence.
     """
 
     agree: int
@@ -86,9 +87,9 @@ class BeamAgreement(NamedTuple):
 
     @property
     def against(self) -> float | None:
-        """Share of beams that are against the grid, of those it knows something of; None if they are too few.
+        """Share of the beams on known cells that are against the grid; None if they are too few to judge.
 
-        Where it knows little of what the scan sees, so many against it are enough to judge.
+        If little of what the scan sees is known, AGAINST_BEAMS against it are enough to judge.
         """
         against = self.into_free + self.through
         known = self.agree + against
@@ -111,10 +112,10 @@ def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: i
 
 
 def sampled(blocks: int, firm: int, weigh: Callable[[np.int16, np.uint32], NDArray[np.float64]]) -> Agreement:
-    """Return what `weigh` finds: it takes `least` and `mask` as `_add.weigh` does, and returns its five weights.
+    """Return the agreement by `weigh`, which takes `least` and `mask` as `_add.weigh`, and returns its five weights.
 
-    Of a frame with more than SAMPLE blocks every second, fourth ... is looked at, by a hash of its coordinates: the
-    same ones whatever their order.
+    A frame with more than SAMPLE blocks is sampled: a hash of the coordinates picks every second, fourth, ... block,
+    the same ones in whatever order.
     """
     mask = (1 << max(blocks // SAMPLE, 1).bit_length() - 1) - 1
     weights = weigh(np.int16(min(firm, LARGEST)), np.uint32(mask))

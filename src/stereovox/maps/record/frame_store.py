@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kept frames on disk: packs of images that never change, and an index with their poses.
 
-Files are named after what they hold. So a checkpoint writes only what is new, besides the index; whatever the manifest
-of the map names is there before it. Images are read when they are needed.
+Files are named by a digest of their contents. So a checkpoint writes only new packs and the index; all files that the
+map's manifest names exist before it does. Images are read when they are needed.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from stereovox.maps.record.health import FULL
 from stereovox.maps.record.kept_frames import DTYPES, InFile, KeptFrame, KeptFrames, Packed, PackedCloud, digest_of
 
 FRAME_FILES = r"frames-[0-9a-f]{12}|\.frames\.new"
-"""Names of the files, as a pattern; the last is being written."""
+"""Pattern of the file names; the last is a file being written."""
 IN_A_PACK = 64
 """Frames in a file."""
 MAX_INDEX = 1 << 29
-"""Bytes of an index; a frame takes less than a kilobyte."""
+"""Most bytes of an index; a frame takes less than a kilobyte."""
 CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera, "lidar": Lidar}
 QUALITIES = (FULL, "near", "coarse")
 MAX_NAME = 4096
-"""Letters of a frame's name."""
+"""Most letters of a frame's name."""
 
 
 def write_frames(folder: Path, kept: KeptFrames) -> dict[str, Any]:
-    """Write frames into the folder of a map, and return what its manifest must say of them. Raises OSError."""
+    """Write frames into the folder of a map, and return their entry for its manifest. Raises OSError."""
     frames, packs = kept.frames, _packs(kept)
     for name, pack in packs:
         if not _is_there(folder / name, pack):
@@ -52,7 +52,7 @@ def write_frames(folder: Path, kept: KeptFrames) -> dict[str, Any]:
 
 
 def move_frames(folder: Path, kept: KeptFrames) -> None:
-    """Tell frames that were read from this folder where they are now, before the files of an earlier save go."""
+    """Point frames that were read from this folder to its new files, before the files of an earlier save go."""
     home = folder.resolve()
     for name, pack in _packs(kept):
         start = 0
@@ -64,14 +64,14 @@ def move_frames(folder: Path, kept: KeptFrames) -> None:
 
 
 def files_of_frames(saved: Any) -> set[str]:
-    """Return the names of the files that a manifest says hold frames."""
+    """Return the names of the frame files in a manifest's entry."""
     return set() if saved is None else {str(saved["index"]), *map(str, saved["packs"])}
 
 
 def read_frames(folder: Path, saved: Any, budget: int | None) -> KeptFrames | None:
     """Return the frames of a saved map; their images are read when they are needed.
 
-    Raises KeyError, TypeError, ValueError or OSError for what `write_frames` cannot have written.
+    Raises KeyError, TypeError, ValueError or OSError if `write_frames` cannot have written them.
     """
     if saved is None:
         return None
@@ -82,13 +82,13 @@ def read_frames(folder: Path, saved: Any, budget: int | None) -> KeptFrames | No
     index = json_value(content)
     spacing = float(index["spacing"])
     if not 0 <= spacing < inf:
-        raise ValueError(f"kept frames: spacing {spacing}")
+        raise ValueError(f"kept frames: invalid spacing {spacing}")
     cameras = [_camera_from(one) for one in index["cameras"]]
     return KeptFrames(budget, _frames_from([folder / name for name in names[1:]], index["frames"], cameras), spacing)
 
 
 def _packs(kept: KeptFrames) -> list[tuple[str, Sequence[KeptFrame]]]:
-    """Return the frames of each file and its name."""
+    """Return the name of each file and its frames."""
     frames = kept.frames
     packs = [frames[start : start + IN_A_PACK] for start in range(0, len(frames), IN_A_PACK)]
     return [(_name("".join(frame.packed.digest for frame in pack).encode()), pack) for pack in packs]
@@ -100,7 +100,7 @@ def _name(content: bytes) -> str:
 
 def _checked(name: Any) -> str:
     if not isinstance(name, str) or "/" in name or not name.startswith("frames-"):
-        raise ValueError(f"kept frames: '{name}' is no name of theirs")
+        raise ValueError(f"kept frames: invalid file name '{name}'")
     return name
 
 
@@ -109,7 +109,7 @@ def _is_there(file: Path, pack: Sequence[KeptFrame]) -> bool:
 
 
 def _write(folder: Path, name: str, parts: Iterable[bytes]) -> None:
-    """Write a file so that it is whole where it has its name."""
+    """Write a file so that it is whole once it has its name."""
     temporary = folder / ".frames.new"
     with temporary.open("wb") as file:
         for part in parts:
@@ -151,7 +151,7 @@ def _frame_to(frame: KeptFrame, camera: int) -> dict[str, Any]:
 
 
 def _layout(packed: Packed | PackedCloud) -> dict[str, Any]:
-    """Return how the bytes of a frame are shared out."""
+    """Return the layout of a frame's bytes."""
     if isinstance(packed, Packed):
         return {"depth_bytes": packed.depth_bytes}
     return {"counts": list(packed.counts), "sizes": list(packed.sizes)}
@@ -160,7 +160,7 @@ def _layout(packed: Packed | PackedCloud) -> dict[str, Any]:
 def _packed_from(saved: Any, content: InFile, camera: VirtualCamera | Lidar) -> Packed | PackedCloud:
     dtype = str(saved["dtype"])
     if dtype not in DTYPES:
-        raise ValueError("a kept frame is of no kind that is known")
+        raise ValueError("a kept frame has an unknown type")
     if not isinstance(camera, Lidar):
         depth_bytes = count_in(saved, "depth_bytes")
         if not depth_bytes <= content.size:
@@ -168,9 +168,9 @@ def _packed_from(saved: Any, content: InFile, camera: VirtualCamera | Lidar) -> 
         return Packed(dtype, depth_bytes, content, content.digest)
     counts, sizes = ([int(number) for number in saved[key]] for key in ("counts", "sizes"))
     if len(counts) != 3 or len(sizes) != 3 or not all(-1 <= count <= MAX_POINTS for count in counts):
-        raise ValueError("a kept cloud has no size that can be")
+        raise ValueError("a kept cloud has an invalid size")
     if counts[0] < 0 or min(sizes) < 0 or sum(sizes) != content.size or dtype == "uint16":
-        raise ValueError("a kept cloud does not fill its bytes")
+        raise ValueError("a kept cloud does not match its bytes")
     return PackedCloud(
         dtype, (counts[0], counts[1], counts[2]), (sizes[0], sizes[1], sizes[2]), content, content.digest
     )
@@ -194,9 +194,9 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera | Lidar], pack: Path
     stamp_ns, pose = saved["seen"]
     blocks = np.array(saved["blocks"], np.int32)
     if saved["quality"] not in QUALITIES:
-        raise ValueError("a kept frame is of no kind that is known")
+        raise ValueError("a kept frame has an unknown quality level")
     if blocks.shape != (2, 3) or len(pose) != 12 or count_in(saved, "camera") >= len(cameras):
-        raise ValueError("a kept frame has no place or no camera")
+        raise ValueError("a kept frame has no valid pose, blocks or camera")
     turn, shift = _numbers(saved["pose_sigma"])
     content, camera = InFile((pack, start), size, str(saved["digest"])), cameras[saved["camera"]]
     return KeptFrame(
@@ -212,7 +212,7 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera | Lidar], pack: Path
 def _numbers(saved: Any) -> list[float]:
     numbers = [float(number) for number in saved]
     if not all(abs(number) <= FARTHEST for number in numbers):  # False for NaN
-        raise ValueError("kept frames: a pose that cannot be")
+        raise ValueError("kept frames: an invalid pose")
     return numbers
 
 

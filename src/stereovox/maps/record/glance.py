@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A glance: how far away a sensor saw something in each direction; and what a later frame says of it.
+"""A glance: the range that a sensor saw in each direction; later frames are compared with it.
 
-Two glances from different poses tell a world from a fault: what is in the world stays where it is, what is in the
-camera (dirt, a dead half, a frozen image) moves with it, and noise does neither.
+Two glances from different poses separate a changed world from a fault: things in the world stay in place, faults of the
+camera (dirt, a dead half, a frozen image) move with it, and noise does neither.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from stereovox.geometry.se3 import Transform
 from stereovox.maps.record._glance import SAME, SIDE, UNSEEN, bin_points, place
 
 MARKS = 300
-"""Points of a glance that later frames are compared with."""
+"""Most points of a glance that later frames are compared with."""
 AT_REST = np.eye(4, dtype=np.float32)[:3]
-"""Of points that are in the sensor and not in the world."""
+"""Motion of points that are fixed to the sensor, not to the world."""
 
 
 class Glance(NamedTuple):
-    """What a sensor saw once.
+    """The view of a sensor at one time.
 
-    pose: first three rows of T_world_sensor, 12 numbers. ranges: SIDE x SIDE float16 in metres as bytes, 0: nothing.
+    pose: first three rows of T_world_sensor, 12 numbers. ranges: SIDE x SIDE float16 in metres as bytes, 0 for none.
     """
 
     pose: tuple[float, ...]
@@ -35,12 +35,12 @@ class Glance(NamedTuple):
 
     @classmethod
     def at(cls, points: NDArray[np.float64], T_world_sensor: Transform) -> Glance:
-        """Return the glance at points (N, 3) in the sensor's frame."""
+        """Return the glance of points (N, 3) in the sensor's frame."""
         return cls.of(binned(points), T_world_sensor)
 
     @classmethod
     def of(cls, ranges: NDArray[np.float32], T_world_sensor: Transform) -> Glance:
-        """Return the glance with ranges (SIDE, SIDE) in metres, 0: nothing."""
+        """Return the glance with ranges (SIDE, SIDE) in metres, 0 for none."""
         packed = np.minimum(ranges, np.float32(6e4)).astype(np.float16)
         return cls(tuple(T_world_sensor[:3].ravel().tolist()), packed.tobytes())
 
@@ -55,18 +55,18 @@ class Glance(NamedTuple):
 
     @classmethod
     def unpacked(cls, pose: tuple[float, ...], text: str) -> Glance:
-        """Return a glance that was saved. Raises ValueError for what cannot have been."""
+        """Return a saved glance. Raises ValueError if the text cannot be one."""
         try:
             ranges = zlib.decompressobj().decompress(b64decode(text, validate=True), 2 * SIDE * SIDE + 1)
         except (TypeError, zlib.error) as error:
-            raise ValueError(f"history: a glance cannot be read: {error}") from None
+            raise ValueError(f"history: a glance is damaged: {error}") from None
         metres = np.frombuffer(ranges, np.float16) if len(ranges) == 2 * SIDE * SIDE else np.full(1, np.nan)
         if not (np.isfinite(metres) & (metres >= 0)).all():
-            raise ValueError("history: the ranges of a glance are no distances")
+            raise ValueError("history: the ranges of a glance are not distances")
         return cls(pose, ranges)
 
     def votes(self, points: NDArray[np.float64], T_world_sensor: Transform, tolerance: NDArray[np.float64]) -> Votes:
-        """Return what this glance says of points (N, 3) in the sensor's frame that a later frame saw.
+        """Compare points (N, 3) in the sensor's frame, which a later frame saw, with this glance.
 
         tolerance: (N,) metres by which ranges may differ.
         """
@@ -86,9 +86,9 @@ class Glance(NamedTuple):
 
 
 class Votes(NamedTuple):
-    """How many points were seen before at the same place of the world, or in the same direction from the sensor.
+    """How many points an earlier glance saw at the same place in the world, or at the same place in the sensor's frame.
 
-    world, sensor: only there. neither: at neither. both: at both, which says nothing.
+    world, sensor: only there. neither: at neither. both: at both, which decides nothing.
     """
 
     world: int = 0
@@ -98,7 +98,7 @@ class Votes(NamedTuple):
 
 
 def binned(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the ranges (SIDE, SIDE) in metres of points (N, 3) in the sensor's frame; 0: nothing."""
+    """Return the ranges (SIDE, SIDE) in metres of points (N, 3) in the sensor's frame, 0 for none."""
     ranges = np.zeros((SIDE, SIDE), np.float32)
     bin_points(np.ascontiguousarray(points, np.float32), ranges)
     return ranges
@@ -117,7 +117,7 @@ def _median(ranges: bytes) -> float:
 
 
 class Marks(NamedTuple):
-    """Points of a glance that later frames are compared with, (N, 3) each, in the sensor's frame and in the world's."""
+    """Points of a glance that later frames are compared with, (N, 3) each, in the sensor's and in the world frame."""
 
     sensor: NDArray[np.float32]
     world: NDArray[np.float64]
@@ -125,7 +125,7 @@ class Marks(NamedTuple):
 
 @lru_cache(maxsize=64)
 def marks_of(glance: Glance) -> Marks:
-    """Return at most MARKS points of a glance, in the middle of their bins."""
+    """Return at most MARKS points of a glance, each in the middle of its bin."""
     metres = _metres(glance.ranges)
     row, column = np.nonzero(metres)
     some = slice(None, None, max(1, -(-len(row) // MARKS)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The health of a map: the age of what it last saw, and what became of recent frames."""
+"""The health of a map: the age of its last data, and what became of recent frames."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from stereovox.frame.stamp_clock import StampClock, StampsBy
 from stereovox.kernels.threads import MapLock
 
 MAX_FRAMES = 1000
-"""Recent frames that are remembered."""
+"""Most recent frames that are remembered."""
 FULL = "full"
-"""Name of the quality level that leaves nothing out."""
+"""Name of the quality level that omits nothing."""
 State = Literal["waiting", "current", "degraded", "stale", "lost"]
 STALE: tuple[State, ...] = ("stale", "lost")
-"""States in which a map is too old to be acted on: what leaves it while it grows is silent."""
+"""States in which a map is too old to act on: outputs of a growing map fall silent."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Health:
 
     Attributes:
         state: `waiting`: no trusted frame yet. `current`. `degraded`: recent frames were refused or used at reduced
-            quality, or one of several sensors is silent. `stale`, `lost`: what the last trusted frame shows is older
-            than `trust.stale_s`, `trust.lost_s`; stale as well while frames of any sensor come that late.
-        age_s: Seconds since what the last trusted frame shows, by its stamp (`Mapper.stamp_clock`), and at least since
+            quality, or one of several sensors is silent. `stale`, `lost`: the last trusted frame is older than
+            `trust.stale_s`, `trust.lost_s`; also stale while frames of any sensor arrive that late.
+        age_s: Seconds since the last trusted frame was taken, by its stamp (`Mapper.stamp_clock`), and at least since
             it arrived; None while waiting.
         ages_s: The same for each sensor.
         stamp_ns: Time of the last trusted frame by its own clock, in nanoseconds; None while waiting.
@@ -63,7 +63,7 @@ class Health:
 
 
 class MonotonicClock:
-    """A clock that never goes back: it continues where the clock it reads was set back."""
+    """A clock that never goes back: it continues when the clock that it reads is set back."""
 
     def __init__(self, clock: Callable[[], int]):
         self._clock, self._lock = clock, MapLock()
@@ -107,7 +107,7 @@ class HealthMonitor:
         self._recent: deque[tuple[int, str, str]] = deque(maxlen=MAX_FRAMES)  # arrival, refusal, quality
 
     def accept(self, arrived_ns: int, sensor: str, stamp_ns: int, quality: str) -> None:
-        """Record a frame that the map took in; arrived_ns: by `now`."""
+        """Record a frame that was integrated; arrived_ns: by `now`."""
         self.stamps.heard(sensor, stamp_ns, arrived_ns)
         self._taken[sensor] = _Taken(stamp_ns, arrived_ns, max(self.stamps.age_ns(stamp_ns, arrived_ns), 0))
         self._stamp_ns = stamp_ns
@@ -136,12 +136,11 @@ class HealthMonitor:
         )  # fmt: skip
 
     def _age_ns(self, one: _Taken, now_ns: int) -> int:
-        """Return how long ago was what a frame shows: by its stamp, and at least since it arrived as late as it did."""
+        """Return the age of a frame: by its stamp, and at least its delay plus the time since it arrived."""
         return max(now_ns - one.arrived_ns + one.late_ns, self.stamps.age_ns(one.stamp_ns, now_ns))
 
     def _late_ns(self, one: _Taken, now_ns: int) -> int:
-        """Return how old a frame was when it arrived, as is known by now; 0 where it came so long ago that it counts as
-        silent."""
+        """Return how old a frame was when it arrived, as known by now; 0 if its sensor counts as silent since."""
         since_ns = now_ns - one.arrived_ns
         if since_ns > self._stale_ns:
             return 0
@@ -168,7 +167,7 @@ def _text(
             others = counts.total() - sum(number for _, number in counts.most_common(3))
             listed += f", {others} x other" if others else ""
             parts.append(f"{counts.total()} of {frames} frames {word} ({listed})")
-    parts += [f"frames of '{sensor}' come {ns / 1e9:.2f} s late" for sensor, ns in list(late.items())[:3]]
+    parts += [f"frames of '{sensor}' arrive {ns / 1e9:.2f} s late" for sensor, ns in list(late.items())[:3]]
     if state == "degraded":
         parts += [f"sensor '{sensor}' silent for {ns / 1e9:.2f} s" for sensor, ns in list(silent.items())[:3]]
     return f"{state}: {'; '.join(parts)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frame history of a map: how many it holds, which were refused and why, and each sensor's last trusted frame."""
+"""The frame history of a map: number of frames, refusals by reason, and each sensor's last trusted frame."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.loop_lines import LoopLines
 
 MAX_SENSORS = 64
-"""Sensors that one map distinguishes."""
+"""Most sensors that one map distinguishes."""
 MAX_REASONS = 256
-"""Reasons that refusals are counted by; further ones count as OTHERS."""
+"""Most reasons by which refusals are counted; further ones count as OTHERS."""
 OTHERS = "others"
 MAX_NAME_LENGTH = 256
 MAX_NOTES = 16
-"""Notes about an imported file."""
+"""Most notes about an imported file."""
 MAX_GLANCES = 4
-"""Glances that are kept of each sensor: what it saw lately, from poses apart."""
+"""Most recent glances kept of each sensor, from different poses."""
 EARLIEST, LATEST = -(2**63), 2**63 - 1
 """Range of stamps in int64 nanoseconds."""
 CHANGED, MOVED = "changed", "moved"
@@ -43,20 +43,20 @@ class Streak(NamedTuple):
 
 
 class ImageFingerprint(NamedTuple):
-    """The last image of a sensor: its checksum and the pose it was first seen at, as in `StampedPose`."""
+    """The last image of a sensor: its checksum and the pose at which it was first seen, as in `StampedPose`."""
 
     digest: int
     pose: tuple[float, ...]
 
 
 class RunningMean(NamedTuple):
-    """Exponential mean of how far a sensor's frames disagree with the map, 0 to 1, and of the distance from it."""
+    """Exponential mean of the disagreement of a sensor's frames with the map, 0 to 1, and of the deviation from it."""
 
     mean: float
     spread: float
 
     def updated(self, share: float, gain: float) -> RunningMean:
-        """Return both after one more frame, which counts with weight `gain`."""
+        """Return both after one more frame, which has the weight `gain`."""
         off = share - self.mean
         return RunningMean(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
 
@@ -65,7 +65,7 @@ class DisagreementSpell(NamedTuple):
     """Frames of one sensor that disagree with the map: stamps of the first and the last, and how many follow the first.
 
     fits: how many of them would agree from another pose. verdict: CHANGED or MOVED; "" while it is open. looks: how
-    many of the last ones in a row showed a changed world. glance: what the next one is compared with.
+    many of the last ones in a row showed a changed world. glance: the one to compare the next frame with.
     """
 
     since_ns: int
@@ -81,15 +81,15 @@ class DisagreementSpell(NamedTuple):
         return self._replace(last_ns=stamp_ns, frames=self.frames + 1)
 
     def lasted_ns(self, untimed_hz: float) -> int:
-        """Return how long it has lasted; `untimed_hz` is the frame rate where stamps stand still or went back."""
+        """Return how long it has lasted; `untimed_hz`: the frame rate if stamps did not advance."""
         return self.last_ns - self.since_ns if self.last_ns > self.since_ns else round(1e9 * self.frames / untimed_hz)
 
 
 class Imported(NamedTuple):
-    """What a map was imported from.
+    """The file that a map was imported from.
 
-    file: name of the file, without its folder. holds: what that is, in a few words (`PLY, 12,345 points`).
-    notes: what was decided for the user, a phrase each (`cells of 0.05 m, since points lie about 0.021 m apart`).
+    file: name of the file, without its folder. holds: its contents in a few words (`PLY, 12,345 points`).
+    notes: decisions made for the user, a phrase each (`cells of 0.05 m, since points are about 0.021 m apart`).
     """
 
     file: str
@@ -97,11 +97,11 @@ class Imported(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def lines(self) -> str:
-        """Return lines for people: `imported from cloud.ply (PLY, 12,345 points)`, then the notes, one a line."""
+        """Return lines for people: `imported from cloud.ply (PLY, 12,345 points)`, then one note per line."""
         return "\n  ".join((f"imported from {self.file} ({self.holds})", *self.notes))
 
     def saved(self) -> dict[str, Any]:
-        """Return what a file holds of it: texts from another program's file may be longer than what can be loaded."""
+        """Return plain values for JSON, cut to the lengths that can be loaded: other programs' texts may be longer."""
         file, holds, *notes = (
             shortened(one_line(text), MAX_NAME_LENGTH) for text in (self.file, self.holds, *self.notes[:MAX_NOTES])
         )
@@ -110,12 +110,12 @@ class Imported(NamedTuple):
 
 @dataclass
 class History:
-    """Everything a map remembers of its frames; saved with it, so that a run can stop and resume anywhere.
+    """Everything a map remembers about its frames; saved with it, so that a run can stop and resume anywhere.
 
     Attributes:
         frames: Number of frames in the map.
         refused: Number of refused frames, by reason.
-        settled: How often frames were accepted again after a jump, a reset or a disagreement, by its reason.
+        settled: How often frames were accepted again after a jump, a reset or a disagreement, by reason.
         quality: Number of frames by quality level (`full`, `near`, `coarse`).
         recording: Name of the recording, if known.
         last_frame: Name and stamp of the frame offered last.
@@ -125,11 +125,11 @@ class History:
         looks: Last image of each camera.
         usual: Usual disagreement with the map of each camera's frames, 0 to 1.
         doubts: Cameras whose last frames disagree with the map more than usual.
-        glances: What each sensor saw lately, from poses apart, the newest last; later frames are compared with it.
-        imported: The file of another program that the map began with; None if there was none.
-        loops: The loops that were closed; None if none were sought, or poses were corrected otherwise since.
-        recordings: Number of recordings that were merged as their poses said; 1 if none were, or `join` made one way
-            of them, which it can where one was made after the other.
+        glances: Recent views of each sensor from different poses, the newest last; later frames are compared with them.
+        imported: The file of another program that the map began with; None for a map without one.
+        loops: The loops that were closed; None if nobody searched for loops, or poses were corrected otherwise since.
+        recordings: Number of recordings that were merged by their given poses; 1 without a merge, or if `join` made
+            one path of them, which it can if they were recorded one after the other.
     """
 
     frames: int = 0
@@ -203,7 +203,7 @@ class History:
     def loaded(cls, saved: dict[str, Any]) -> History:
         """Return the history in a saved manifest.
 
-        Raises KeyError, TypeError or ValueError for what cannot have been saved.
+        Raises KeyError, TypeError or ValueError if the values cannot be one.
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
         history = cls(
@@ -230,11 +230,11 @@ class History:
             name: _glances_from(seen) for name, seen in _sensors(entries.get("glances", {})).items()
         }
         if history.refused.total() != refused:
-            raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
+            raise ValueError(f"frames_refused is {refused}, but its reasons add up to {history.refused.total()}")
         return history
 
     def _last_frame(self) -> dict[str, Any] | None:
-        """Return number (from 1, refused frames counted), name and stamp of the last frame."""
+        """Return number (from 1, refused frames included), name and stamp of the last frame."""
         if self.last_frame is None:
             return None
         name, stamp_ns = self.last_frame
@@ -242,7 +242,7 @@ class History:
 
 
 class WithHistory:
-    """Properties that every map has of its frame history."""
+    """Properties of every map that come from its frame history."""
 
     history: History
 
@@ -303,7 +303,7 @@ def _glance_from(saved: Any) -> Glance:
 
 def _glances_from(saved: Any) -> tuple[Glance, ...]:
     if not isinstance(saved, list) or len(saved) > MAX_GLANCES:
-        raise ValueError(f"history: glances are no list of at most {MAX_GLANCES}")
+        raise ValueError(f"history: glances are not a list of at most {MAX_GLANCES}")
     return tuple(map(_glance_from, saved))
 
 
@@ -311,7 +311,7 @@ def _doubt_from(saved: Any) -> DisagreementSpell:
     since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
     frames, fits, looks = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits", "looks"))
     if saved["verdict"] not in ("", CHANGED, MOVED):
-        raise ValueError("history: a doubt has no such verdict")
+        raise ValueError("history: a doubt has an unknown verdict")
     seen = None if saved["glance"] is None else _glance_from(saved["glance"])
     return DisagreementSpell(since_ns, last_ns, frames, fits, saved["verdict"], looks, seen)
 
@@ -319,7 +319,7 @@ def _doubt_from(saved: Any) -> DisagreementSpell:
 def _usual_from(saved: Any) -> RunningMean:
     shares = RunningMean(*saved)
     if any(type(share) not in (float, int) or not 0 <= share <= 1 for share in shares):
-        raise ValueError("history: a share is no number from 0 to 1")
+        raise ValueError("history: a share is not a number from 0 to 1")
     return shares
 
 
@@ -342,7 +342,7 @@ def _imported_from(saved: Any) -> Imported | None:
     if saved is None:
         return None
     if not isinstance(saved["notes"], list | tuple) or len(saved["notes"]) > MAX_NOTES:
-        raise ValueError(f"imported: notes are no list of at most {MAX_NOTES}")
+        raise ValueError(f"imported: notes are not a list of at most {MAX_NOTES}")
     return Imported(_name(saved["file"]), _name(saved["holds"]), tuple(map(_name, saved["notes"])))
 
 
@@ -356,23 +356,23 @@ def _streak_from(saved: Any) -> Streak:
 
 def _sensors(saved: Any) -> dict[str, Any]:
     if not isinstance(saved, dict) or len(saved) > MAX_SENSORS:
-        raise ValueError(f"history: sensors are no table of at most {MAX_SENSORS}")
+        raise ValueError(f"history: sensors are not a table of at most {MAX_SENSORS}")
     return {_name(name): value for name, value in saved.items()}
 
 
 def _counts(saved: Any, what: str) -> Counter[str]:
     if not isinstance(saved, dict) or len(saved) > MAX_REASONS + 1:
-        raise ValueError(f"history.{what} is no table of at most {MAX_REASONS} counts")
+        raise ValueError(f"history.{what} is not a table of at most {MAX_REASONS} counts")
     return Counter({_name(name): _whole(number, f"history.{what}") for name, number in saved.items()})
 
 
 def _name(value: Any) -> str:
     if not isinstance(value, str) or len(value) > MAX_NAME_LENGTH:
-        raise ValueError(f"history: a name is no text of at most {MAX_NAME_LENGTH} letters")
+        raise ValueError(f"history: a name is not a text of at most {MAX_NAME_LENGTH} letters")
     return one_line(value)
 
 
 def _whole(value: Any, what: str, least: int = 0) -> int:
     if type(value) is not int or not least <= value <= LATEST:
-        raise ValueError(f"{what} is no whole number from {least} on")
+        raise ValueError(f"{what} is not a whole number of at least {least}")
     return value

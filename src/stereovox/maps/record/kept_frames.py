@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth images and clouds of a map, kept without loss and small, so that their poses can be corrected later."""
+"""The depth images and clouds of a map, compressed without loss, so that their poses can be corrected later."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.record.camera_path import StampedPose
 
 LEVEL = 1
-"""Of zstd: higher ones take twice as long for less than a twentieth of the bytes."""
+"""Level of zstd: higher ones take twice as long and save less than a twentieth of the bytes."""
 SPACING_M = 0.05
-"""Least path length in metres between two frames once not all can be kept; half as many as radians it may turn."""
+"""Least metres between two kept frames once not all can be kept; a turn by twice as many radians counts too."""
 SPARSEST_M = 1e6
-"""Where frames this far apart need too much memory, the budget is for fewer than one frame."""
+"""If frames this far apart exceed the budget, it holds less than one frame."""
 DTYPES = {"uint16": np.uint16, "float32": np.uint32, "float64": np.uint32}
-"""Numbers that depth images hold, and how they are packed."""
+"""Types of depth images, and the integers as which they are packed."""
 NOWHERE = np.zeros((2, 3), np.int32)
 
 
@@ -68,7 +68,7 @@ class InFile:
     """Bytes in a file of a saved map.
 
     Attributes:
-        place: The file and at which byte they begin; another one once the map was saved anew in its folder.
+        place: The file and the byte at which they begin; it changes when the map is saved again in its folder.
         size: Number of bytes.
         digest: Their `digest_of`.
     """
@@ -86,18 +86,18 @@ class InFile:
             if self.place != place:  # another thread has saved the map meanwhile
                 return self.read()
             raise MapFileError(
-                f"{file}: kept frames cannot be read ({error.strerror}); was the map saved anew? load it again, "
+                f"{file}: kept frames cannot be read ({error.strerror}); was the map saved again? reload it, "
                 f"or {_give_up(file.parent)}"
             ) from None
         if digest_of(content) != self.digest:
-            raise MapFileError(f"{file}: kept frames are damaged; make the map anew, or {_give_up(file.parent)}")
+            raise MapFileError(f"{file}: kept frames are damaged; map again, or {_give_up(file.parent)}")
         return content
 
 
 class Packed(NamedTuple):
-    """A depth image without loss, packed.
+    """A depth image, packed without loss.
 
-    dtype: of the depth. depth_bytes: how many of the bytes are its own; the rest are the reasons, if there are any.
+    dtype: of the depth. depth_bytes: how many of the bytes are depth; the rest, if any, are the reasons.
     """
 
     dtype: str
@@ -124,14 +124,14 @@ class Packed(NamedTuple):
                 shape
             )
         except (ValueError, RuntimeError) as error:
-            raise MapFileError(f"a kept frame is damaged ({error}); make the map anew") from None
+            raise MapFileError(f"a kept frame is damaged ({error}); map again") from None
 
 
 class PackedCloud(NamedTuple):
-    """A cloud without loss, packed.
+    """A cloud, packed without loss.
 
-    dtype: of its points. counts: how many points, rays without one, and origins it has; -1: it has none of these.
-    sizes: how many bytes belong to each.
+    dtype: of its points. counts: number of points, rays without a point, and origins; -1 if the cloud lacks the array.
+    sizes: number of bytes of each.
     """
 
     dtype: str
@@ -159,7 +159,7 @@ class PackedCloud(NamedTuple):
                 for count, size, start in zip(self.counts, self.sizes, starts.tolist(), strict=False)
             ]
         except (ValueError, RuntimeError) as error:
-            raise MapFileError(f"a kept cloud is damaged ({error}); make the map anew") from None
+            raise MapFileError(f"a kept cloud is damaged ({error}); map again") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,18 +168,18 @@ class KeptFrame:
 
     Attributes:
         number: How many frames the map held before it.
-        sensor: Which of several sensors took it.
+        sensor: Name of the sensor that took it.
         name: As in `Frame`.
         stamp_ns: As in `Frame`.
-        T_world_sensor: (4, 4) float64, as the frame came with it, or as it was corrected.
-        camera: As in `Frame`; of a cloud its lidar.
+        T_world_sensor: (4, 4) float64, as given with the frame, or as corrected.
+        camera: As in `Frame`; the lidar of a cloud.
         quality: The quality level that it was mapped at.
         pose_sigma: As in `Frame`.
         depth_scale: As in `Frame`.
         farthest: As in `Frame`.
         packed: Its depth image, or the cloud.
         seen: Time and exactly rigid pose of the image that was mapped.
-        blocks: (2, 3) int32, lowest block it has evidence on and first beyond the highest.
+        blocks: (2, 3) int32, lowest block with evidence and the first beyond the highest.
     """
 
     number: int
@@ -197,7 +197,7 @@ class KeptFrame:
     blocks: NDArray[np.int32]
 
     def frame(self) -> Frame | Cloud:
-        """Return the frame, its photo left out, from its present pose. Raises MapFileError if it cannot be read."""
+        """Return the frame without its photo, at its present pose. Raises MapFileError if it cannot be read."""
         if isinstance(self.camera, Lidar):
             return self._cloud(self.camera)
         assert isinstance(self.packed, Packed)
@@ -220,11 +220,11 @@ class KeptFrame:
 class KeptFrames:
     """The frames of a map in the order in which they entered it.
 
-    All are kept until they need more bytes than `budget` (None: no limit). From then on a frame is kept where its
-    sensor has moved or turned far enough since the last one that is, and how far that is doubles whenever it must.
+    All are kept until they need more bytes than `budget` (None: no limit). From then on a frame is kept if its sensor
+    has moved or turned by `spacing` since the last kept one; the spacing doubles whenever the budget is exceeded.
 
     Attributes:
-        spacing: Least path length in metres between two kept frames of a sensor; 0 while all are kept.
+        spacing: Least metres between two kept frames of a sensor; 0 while all are kept.
     """
 
     def __init__(self, budget: int | None = None, frames: Iterable[KeptFrame] = (), spacing: float = 0.0):
@@ -251,16 +251,16 @@ class KeptFrames:
         return self._bytes
 
     def are_all(self, frames: int) -> bool:
-        """Return whether these are all of so many frames."""
+        """Return whether all of this number of frames are kept."""
         return len(self._frames) == frames
 
     def wants(self, sensor: str, seen: StampedPose) -> bool:
-        """Return whether a frame of this sensor from this pose is to be kept."""
+        """Return whether to keep a frame of this sensor from this pose."""
         before = self._last.get(sensor)
         return before is None or self._is_far(before, seen)
 
     def keep(self, frame: KeptFrame) -> None:
-        """Add a frame; where the budget does not hold it, others with similar views are dropped."""
+        """Add a frame; if that exceeds the budget, frames with similar views are dropped."""
         self._frames.append(frame)
         self._last[frame.sensor] = frame.seen
         self._bytes += frame.packed.content.size
@@ -269,7 +269,7 @@ class KeptFrames:
             self._put(self._thinned())
 
     def replace(self, frames: Sequence[KeptFrame]) -> None:
-        """Put corrected frames in the place of the first ones, as many as they are."""
+        """Replace the first frames by as many corrected ones."""
         self._put([*frames, *self._frames[len(frames) :]])
 
     def _put(self, frames: list[KeptFrame]) -> None:
@@ -304,7 +304,7 @@ def kept_frame(
     quality: str,
     evidence: Evidence,
 ) -> KeptFrame:
-    """Return a frame to be kept; what the arguments are: as in `KeptFrame`."""
+    """Return a frame to be kept; arguments: as in `KeptFrame`."""
     T_world_sensor = np.array(frame.T_world_sensor, float)
     turn, shift = map(float, frame.pose_sigma)
     scale, farthest = (1.0, inf) if isinstance(frame, Cloud) else (float(frame.depth_scale), float(frame.farthest))
@@ -315,7 +315,7 @@ def kept_frame(
 
 
 def blocks_seen(evidence: Evidence) -> NDArray[np.int32]:
-    """Return the lowest block with evidence and the first beyond the highest (2, 3), zeros if there is none."""
+    """Return the lowest block with evidence and the first beyond the highest (2, 3), zeros without evidence."""
     parts = [coords for coords in (evidence.coords, evidence.uniform) if len(coords)]
     if not parts:
         return NOWHERE
@@ -324,14 +324,14 @@ def blocks_seen(evidence: Evidence) -> NDArray[np.int32]:
 
 
 def digest_of(content: bytes) -> str:
-    """Return 24 hexadecimal digits that tell whether bytes are still the same."""
+    """Return 24 hexadecimal digits that change if the bytes do."""
     return hashlib.blake2b(content, digest_size=12).hexdigest()
 
 
 def _give_up(folder: Path) -> str:
-    """Return how a map whose cells are whole can be used without its frames."""
+    """Return the command by which a map with intact cells can be used without its frames."""
     words = "stereovox", "map", "RECORDING", "--out", str(folder), "--resume", "--set", "map.keep_frames=false"
-    return f"give them up to go on or to merge: {shlex.join(words)}"
+    return f"drop the frames to continue or to merge: {shlex.join(words)}"
 
 
 def _packed(image: NDArray[Any]) -> bytes:
@@ -365,7 +365,7 @@ def _encoded(array: NDArray[np.uint8]) -> bytes:
 
 
 def _decoded(content: bytes, size: int) -> bytes:
-    """Return what zstd makes of bytes. Raises ValueError if that is not just `size` bytes, and RuntimeError."""
+    """Return bytes decompressed by zstd. Raises ValueError unless they are `size` bytes, and RuntimeError."""
     from numcodecs.zstd import Zstd
 
     if zstd_size(content[:18]) != size:

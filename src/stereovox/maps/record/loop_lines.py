@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loops that were closed in a map, as lines between places: what is worth drawing of them, saved with the map."""
+"""The closed loops of a map as lines between places, for drawing; saved with the map."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from stereovox.geometry.se3 import Transform, transform_points
 from stereovox.maps.record.camera_path import FARTHEST
 
 MAX_LINES = 8192
-"""Lines of a kind that are kept; of more of them some, spread evenly."""
+"""Most lines kept of each kind; if there are more, an even selection is kept."""
 ENDS = 6
-"""Numbers of a line."""
+"""Numbers per line."""
 KEPT_AS = "<f4"
 
 
@@ -45,7 +45,7 @@ class Lines:
         return np.frombuffer(self.packed, KEPT_AS).reshape(-1, 2, 3).astype(float)
 
     def moved(self, T: Transform) -> Lines:
-        """Return the lines in a world into which T (4, 4) leads."""
+        """Return the lines transformed by T (4, 4)."""
         return Lines(self.number, Lines.between(transform_points(T, self.ends)).packed)
 
     def saved(self) -> dict[str, Any]:
@@ -54,26 +54,26 @@ class Lines:
 
     @classmethod
     def loaded(cls, saved: Any) -> Lines:
-        """Return saved lines. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        """Return saved lines. Raises KeyError, TypeError or ValueError if the values cannot be lines."""
         number, text = saved["number"], saved["ends"]
         if not isinstance(text, str) or len(text) > 8 * ENDS * MAX_LINES:
-            raise ValueError("loops: no packed numbers")
+            raise ValueError("loops: not packed numbers")
         lines = cls(number, base64.b64decode(text, validate=True))
         ends = np.frombuffer(lines.packed, KEPT_AS)
         if len(ends) % ENDS or not (np.abs(ends) <= FARTHEST).all():  # False for NaN
-            raise ValueError("loops: places that cannot be")
+            raise ValueError("loops: invalid places")
         if type(number) is not int or min(number, MAX_LINES) != len(ends) // ENDS:
-            raise ValueError(f"loops: {number} where there are {len(ends) // ENDS} lines")
+            raise ValueError(f"loops: {number} instead of {len(ends) // ENDS} lines")
         return lines
 
 
 @dataclass(frozen=True)
 class LoopLines:
-    """What a map remembers of its loop closure.
+    """The record of loop closure in a map.
 
     Attributes:
-        closed: Lines between the places of loops that were closed.
-        refused: Lines between places that look the same and were not believed to be.
+        closed: Lines between the two places of each closed loop.
+        refused: Lines between places that look the same but were rejected as loops.
     """
 
     closed: Lines = Lines()
@@ -85,11 +85,11 @@ class LoopLines:
         return cls(Lines.between(closed), Lines.between(refused))
 
     def moved(self, T: Transform) -> LoopLines:
-        """Return the lines in a world into which T (4, 4) leads."""
+        """Return the lines transformed by T (4, 4)."""
         return LoopLines(self.closed.moved(T), self.refused.moved(T))
 
     def counts(self) -> dict[str, int]:
-        """Return how many there are of each kind."""
+        """Return the number of lines of each kind."""
         return {"closed": self.closed.number, "refused": self.refused.number}
 
     def saved(self) -> dict[str, Any]:
@@ -98,5 +98,5 @@ class LoopLines:
 
     @classmethod
     def loaded(cls, saved: Any) -> LoopLines:
-        """Return what was saved. Raises KeyError, TypeError or ValueError for what cannot have been."""
+        """Return saved lines. Raises KeyError, TypeError or ValueError if the values cannot be lines."""
         return cls(Lines.loaded(saved["closed"]), Lines.loaded(saved["refused"]))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the clocks of the sensors agree with that of their poses, by when messages arrive: live and in a replay.
+"""Check by arrival times whether the clocks of sensors and poses agree: live and in a replay.
 
-A bag may be played at any rate, with or without `/clock`, paused, and begun again. So time is counted as it passes for
-the stamps of the poses. While these do not come steadily, nothing can be said, except of a stamp that goes back.
+A bag may be played at any rate, with or without `/clock`, paused, and restarted. So time is counted at the rate at
+which the stamps of the poses pass. While these do not arrive steadily, only a stamp that goes back is evidence.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from stereovox.frame import AnyFrame
 from stereovox.sources.poses.clock_watch import ANNOUNCED_NS, ClockDoubt, Delays, Heard
 
 WINDOW_NS, SPAN_NS, FEWEST = 1_000_000_000, 250_000_000, 3
-"""Time over which the rate of poses is found; how long they must have come for it, and how many at least."""
+"""Time over which the rate of poses is measured; the least span and number of poses for it."""
 PAUSE_NS = 300_000_000
-"""Poses that stay away for longer were paused perhaps, and begin anew."""
+"""After a longer gap in the poses, perhaps a pause, the measurement starts again."""
 LIVE, LIVE_OFF_NS, PLAYED_OFF_NS = 0.1, 150_000_000, 40_000_000
-"""A rate this near to 1 is 1; by how much poses may then arrive off it, and at another rate."""
+"""A rate this near to 1 counts as 1; largest jitter of poses at that rate, and at another rate."""
 SLOWEST, FASTEST = 0.1, 2.5
-"""Rates between which arrivals tell something: in a faster replay a few milliseconds count for too much."""
+"""Rates between which arrivals are evidence: in a faster replay a few milliseconds weigh too much."""
 BEGUN_AGAIN_NS = 1_000_000_000
-"""Stamps that go back by more are not those of a clock that announces itself: a bag may begin again."""
+"""If stamps go back by more, no clock was set back: the bag may have restarted."""
 
 
 class Pace:
-    """How the stamps of poses arrive. simulated: whether time may slow down while nothing is played (use_sim_time).
+    """The pace at which stamps of poses arrive. simulated: whether time may stop while nothing plays (use_sim_time).
 
     Attributes:
-        delays: Their delays, by time as it passes for the stamps.
-        rate: How fast that is: 1 live, that of the player in a replay; NaN while poses do not come steadily.
+        delays: Their delays, in the time of the stamps.
+        rate: The speed of that time: 1 live, the player's rate in a replay; NaN while poses do not arrive steadily.
     """
 
     def __init__(self, simulated: bool = False) -> None:
         self.delays, self.rate, self._simulated = Delays(), float("nan"), simulated
         self._recent: deque[tuple[int, int]] = deque()  # arrival and stamp
-        self._anchor, self._used = (0, 0), 1.0  # arrival and time as it passes for the stamps, and how fast
+        self._anchor, self._used = (0, 0), 1.0  # an arrival in both times, and the rate in use
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> None:
-        """Take in the stamp of a pose. arrived_ns: monotonic."""
+        """Record the stamp of a pose. arrived_ns: monotonic."""
         recent = self._recent
         if recent and stamp_ns < recent[-1][1] - ANNOUNCED_NS:
             recent.clear()
@@ -63,7 +63,7 @@ class Pace:
         self.delays.heard(stamp_ns, self._anchor[1])
 
     def passed_ns(self, arrived_ns: int) -> int:
-        """Return a time of arrival as it passes for the stamps."""
+        """Return a time of arrival in the time of the stamps."""
         return self._anchor[1] + round(self._used * (arrived_ns - self._anchor[0]))
 
     def _found(self) -> float:
@@ -81,16 +81,16 @@ class Pace:
 
 
 class PosesOfSensor(PosesNow, Protocol):
-    """Poses of a sensor in the world as they come. pace: None while nothing moves it."""
+    """Poses of a sensor in the world as they arrive. pace: None while nothing moves it."""
 
     @property
     def pace(self) -> Pace | None:
-        """How their messages arrive."""
+        """The pace of their messages."""
         ...
 
 
 class SensorClock(CameraClock):
-    """Watches the clock of one topic by time as it passes for the stamps of its poses.
+    """Watches the clock of one topic in the time of the stamps of its poses.
 
     Args: as for `CameraClock`. pace: of its poses. apart_ns: as `start_ns`.
     """
@@ -104,7 +104,7 @@ class SensorClock(CameraClock):
         self._before_ns: int | None = None
 
     def heard(self, stamp_ns: int, arrived_ns: int) -> Heard:
-        """Take in the stamp of a message, corrected. arrived_ns: monotonic."""
+        """Record the corrected stamp of a message. arrived_ns: monotonic."""
         back_ns, self._before_ns = (self._before_ns or stamp_ns) - stamp_ns, stamp_ns
         passed_ns, set_back = self.pace.passed_ns(arrived_ns), self.pace.delays.set_back
         if self.pace.rate == self.pace.rate:
@@ -116,21 +116,21 @@ class SensorClock(CameraClock):
 
 
 def cure(doubt: ClockDoubt, ahead_s: float) -> str:
-    """Say what the user can do about a doubt."""
-    late = f"; if it does take that long, give ros.apart_s {abs(doubt.off_ns) / 1e9 + 0.1:.1f}"
+    """Return the user's remedy for a doubt."""
+    late = f"; if delivery does take that long, set ros.apart_s {abs(doubt.off_ns) / 1e9 + 0.1:.1f}"
     return f"{CURE}{late if doubt.start and abs(doubt.off_ns) < LATE_AT_MOST_NS else ''}"
 
 
 CURE = (
     "stamp sensor and poses by one clock (the driver's option for system time, chrony or PTP between machines; "
-    "use_sim_time for all nodes or none), then start the node anew or call ~/reset"
+    "use_sim_time for all nodes or none), then restart the node or call ~/reset"
 )
 LATE_AT_MOST_NS = 5_000_000_000
 """Nothing takes longer to deliver than this."""
 
 
 class SensorClocks:
-    """Those of all topics. apart_s: as `Options.apart_s`. notify: called with each line that a user should see.
+    """The clocks of all topics. apart_s: as `Options.apart_s`. notify: called with each line that a user should see.
 
     background: whether images in doubt are tracked in threads.
     """
@@ -140,12 +140,12 @@ class SensorClocks:
         self._background, self._clocks = background, dict[str, SensorClock]()
 
     def shift_ns(self, topic: str) -> int:
-        """Return what is added to the stamps of a topic, as was found from its motion."""
+        """Return the shift added to the stamps of a topic, as found from its motion."""
         clock = self._clocks.get(topic)
         return clock.shift_ns if clock else 0
 
     def heard(self, topic: str, stamp_ns: int, arrived_ns: int, poses: PosesOfSensor) -> Heard:
-        """Take in the stamp of a message, with its shift. arrived_ns: monotonic."""
+        """Record the shifted stamp of a message. arrived_ns: monotonic."""
         pace, clock = poses.pace, self._clocks.get(topic)
         if pace is None:
             return Heard(judged=False)
@@ -159,14 +159,14 @@ class SensorClocks:
     def check(self, topic: str, view: Callable[[], AnyFrame], heard: Heard, now_ns: int) -> None:
         """Learn from a message, in its turn; raises FrameRefused if its pose is not certain.
 
-        view: returns what it shows of its sensor's motion, with the stamp that was `heard`. now_ns: monotonic.
+        view: returns its evidence of the sensor's motion, with the stamp that was `heard`. now_ns: monotonic.
         """
         clock = self._clocks.get(topic)
         if clock is not None and clock.doubts(heard):
             clock.check(view(), heard, clock.pace.passed_ns(now_ns))
 
     def forget(self) -> None:
-        """Begin anew, as at the start."""
+        """Start again, as at the beginning."""
         for clock in self._clocks.values():
             clock.close()
         self._clocks.clear()

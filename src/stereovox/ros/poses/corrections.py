@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correct the map while it is made: by paths that a SLAM program publishes, or by jumps of odometry in the map."""
+"""Correct the growing map: by paths that a SLAM program publishes, or by jumps of odometry in the map."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ AGAIN_S = 10.0
 
 
 class Corrector(Protocol):
-    """Notes the frames of the map, and asks for corrections."""
+    """Records the frames of the map, and requests corrections."""
 
     def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
-        """Take note of a frame that has a pose. frame_id: the frame that its message is in."""
+        """Record a frame that has a pose. frame_id: the frame of its message."""
         ...
 
     def forget(self) -> None:
-        """Forget the frames: another map begins."""
+        """Discard the frames, for another map begins."""
         ...
 
 
 def corrector_of(node: Any, mapping: Mapping, poses: PoseBuffer, options: Options) -> Corrector | None:
-    """Return what the options ask for, None for nothing."""
+    """Return the corrector of the options, None for none."""
     if options.corrected_path:
         return PathCorrections(mapping, poses, options, node.get_logger())
     return JumpCorrections(mapping, poses, options.odom_frame, node.get_logger()) if options.correct_jumps else None
 
 
 class PathCorrections:
-    """Moves frames to where paths (`nav_msgs/Path`) say that they belong; see `poses_by_path`.
+    """Moves frames to their poses in published paths (`nav_msgs/Path`); see `poses_by_path`.
 
     Attributes:
         topic: The topic of the paths.
@@ -64,16 +64,16 @@ class PathCorrections:
         self._sensors: dict[str, str] = {}
 
     def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
-        """Remember which frame the messages of a topic are in."""
+        """Remember the frame of a topic's messages."""
         self._sensors[sensor.topic] = frame_id
         if sensor.topic == self._first and not self._body:
             self._body = frame_id
 
     def forget(self) -> None:
-        """Keep what is known: frames do not change with the map."""
+        """Keep everything: frame names do not change with the map."""
 
     def on_path(self, data: bytes) -> None:
-        """Ask for a correction by a path; one that was not begun yet is replaced."""
+        """Request a correction by a path; it replaces one that has not begun yet."""
         try:
             _check_stamps(read_path(Wire(data, cdr=True), 2)[0])  # at once: it must not replace a better one that waits
             mounts = self._mounts(header(data)[1])
@@ -84,14 +84,14 @@ class PathCorrections:
             self._mapping.correct(partial(_by_path, data, self.topic, mounts, self._mapping.config), newest_only=True)
 
     def _mounts(self, frame_id: str) -> dict[str, Transform]:
-        """Return T_body_sensor of the topics, nothing before the first frame; raises StereovoxError for a path in
-        another frame than the map, and if no sensor is mounted on the body whose poses it holds.
+        """Return T_body_sensor of the topics, empty before the first frame; raises StereovoxError if the path is not in
+        the map's frame, or if no sensor is mounted on the body whose poses it holds.
         """
         if not (self._sensors and self._body):
             return {}
         world, body = self._poses.world, self._body
         if frame_id not in ("", world):
-            raise StereovoxError(f"it is in frame {frame_id}, the map in {world}; give --world-frame {frame_id}")
+            raise StereovoxError(f"it is in frame {frame_id}, but the map in {world}; give --world-frame {frame_id}")
         mounts = {}
         for topic, sensor in self._sensors.items():
             T_body_sensor = self._fixed(body, sensor)
@@ -104,7 +104,7 @@ class PathCorrections:
         return mounts
 
     def _fixed(self, body: str, frame_id: str) -> Transform | None:
-        """Return T_body_frame (4, 4), None if it is not known or moves."""
+        """Return T_body_frame (4, 4), None if it is unknown or moves."""
         tf = self._poses.tf
         if body == frame_id:
             return np.eye(4)
@@ -114,7 +114,7 @@ class PathCorrections:
 
 
 class JumpCorrections:
-    """Spreads a jump of odometry's frame in the map over the way since the last one; see `OdometryJumps`.
+    """Spreads a jump of odometry's frame in the map over the path since the last one; see `OdometryJumps`.
 
     odom: odometry's frame.
     """
@@ -124,11 +124,11 @@ class JumpCorrections:
         self._jumps = OdometryJumps(min(mapping.config.cell), mapping.config.max_range)
 
     def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud, in_map: bool) -> None:
-        """Ask for a correction if a frame shows that a jump has come to its end."""
+        """Request a correction when a frame shows that a jump has ended."""
         try:
             T_odom_sensor = self._place(frame_id, frame.stamp_ns)
         except FrameRefused as error:
-            self._log.warning(f"jumps are not noticed: {error}", throttle_duration_sec=AGAIN_S)
+            self._log.warning(f"jumps cannot be detected: {error}", throttle_duration_sec=AGAIN_S)
             return
         T_map_odom = frame.T_world_sensor @ inverse(T_odom_sensor)
         poses = self._jumps.add(sensor.topic, frame.stamp_ns, T_map_odom, T_odom_sensor, in_map=in_map)
@@ -136,7 +136,7 @@ class JumpCorrections:
             self._mapping.correct(lambda frames: poses)
 
     def forget(self) -> None:
-        """Forget the frames: another map begins."""
+        """Discard the frames, for another map begins."""
         self._jumps.forget()
 
     def _place(self, frame_id: str, stamp_ns: int) -> Transform:
@@ -148,7 +148,7 @@ class JumpCorrections:
 def _by_path(
     data: bytes, topic: str, mounts: Table[str, Transform], config: Config, frames: Sequence[KeptFrame]
 ) -> dict[FrameKey, Transform]:
-    """Return the poses of frames that a path moves noticeably. Raises StereovoxError if it is of no use."""
+    """Return the poses of frames that a path moves noticeably. Raises StereovoxError if it cannot be used."""
     try:
         stamps, numbers = read_path(Wire(data, cdr=True))
         _check_stamps(stamps)
@@ -159,16 +159,16 @@ def _by_path(
     found = poses_by_path(frames, Poses(stamps, transforms(numbers), where=topic), mounts)
     if not found.poses:
         raise StereovoxError(
-            f"{topic}: none of its poses, from {_span(stamps.tolist())} s, has the stamp of a frame of the map, which "
-            f"are from {_span(frame.stamp_ns for frame in frames)} s; do its poses have those of their images?"
+            f"{topic}: none of its poses, from {_span(stamps.tolist())} s, has the stamp of a frame of the map, from "
+            f"{_span(frame.stamp_ns for frame in frames)} s; do its poses have the stamps of their images?"
         )
     return noticeable(frames, found.poses, SLIGHT * min(config.cell), config.max_range)
 
 
 def _check_stamps(stamps: NDArray[np.int64]) -> None:
-    """Raise StereovoxError if several poses have one stamp: which of them is that of the image?"""
+    """Raise StereovoxError if several poses have one stamp: it is unknown which of them belongs to the image."""
     if len(np.unique(stamps)) < len(stamps):
-        raise StereovoxError("several of its poses have the same stamp; they need those of their images: docs/ros2.md")
+        raise StereovoxError("several of its poses have the same stamp; use the stamps of their images: docs/ros2.md")
 
 
 def _span(stamps_ns: Iterable[int]) -> str:
@@ -177,16 +177,16 @@ def _span(stamps_ns: Iterable[int]) -> str:
 
 
 def check_corrections(options: Options, config: Config) -> None:
-    """Raise StereovoxError, one line, if a map cannot be corrected as the options ask."""
+    """Raise StereovoxError, one line, if a map cannot be corrected as requested."""
     asked = _asked(options)
     if not asked:
         return
     if options.corrected_path and options.correct_jumps:
-        raise StereovoxError("--corrected-path, --correct-jumps: a path says more than jumps do; give it alone")
+        raise StereovoxError("--corrected-path, --correct-jumps: a path makes jumps redundant; give the path alone")
     if options.poses != "given":
         raise StereovoxError(f"{asked}: is not used with --poses {options.poses}; leave one of them out")
     if not config.map.keep_frames:
-        raise StereovoxError(f"{asked}: needs a map in space that keeps its frames; add --set map.keep_frames=true")
+        raise StereovoxError(f"{asked}: needs a 3-D map that keeps its frames; add --set map.keep_frames=true")
     if options.correct_jumps and frame_name(options.world_frame) == frame_name(options.odom_frame):
         odom = options.odom_frame
         raise StereovoxError(f"{asked}: the map is in {odom} itself; give --world-frame map, or {PREFIX}odom_frame")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Localise the robot live by its lidar: in a map (AMCL), or in the map that SLAM makes of the same scans.
 
-Each scan corrects where the odometry's world is in the map. That is a transform like any other, so that frames of all
-sensors wait for it and have it interpolated, as the track of a recording is.
+Each scan corrects the pose of the odometry's world in the map. That is a transform like any other, so frames of all
+sensors wait for it, and it is interpolated like the track of a recording.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from stereovox.sources.bags.robot_messages import StampedTransform, frame_name
 from stereovox.sources.bags.tf import WORLDS
 
 NOT_LOCALISED = "not_localised"
-"""Why frames are refused while it is not known where the robot is."""
+"""Why frames are refused while the robot's pose is unknown."""
 ECHOES = 1000
-"""Own transforms that are remembered, to know them again on /tf."""
+"""Most own transforms that are remembered, to recognise them on /tf."""
 
 
 class Located(NamedTuple):
-    """Where the robot is after a scan.
+    """The pose of the robot after a scan.
 
     pose_map_base, pose_map_odom: (3,) float64 x, y in metres and yaw in radians. covariance: (3, 3) float64 of the
-    first, metres and radians; None: not known. particles: (N, 3) float64, poses that it may have; None: not known.
+    first, metres and radians; None: unknown. particles: (N, 3) float64, its possible poses; None: unknown.
     moved: whether the scan was compared with the map. settled: whether the pose can be trusted.
     """
 
@@ -55,21 +55,21 @@ class Located(NamedTuple):
 
 
 class Localization(Protocol):
-    """A method to find the pose of the robot."""
+    """A method of localising the robot."""
 
     def add(self, scan: Scan) -> Located:
-        """Return where the robot is after one more scan; raises FrameRefused for one that cannot be trusted."""
+        """Return the robot's pose after one more scan; raises FrameRefused for one that cannot be trusted."""
         ...
 
     def restart(self) -> None:
-        """Begin again, as at the start: the clock was set back."""
+        """Start again, as at the beginning, since the clock was set back."""
         ...
 
 
 class MapLocalization(Localization):
     """Adaptive Monte Carlo localisation in a map. start: (3,) x, y, yaw at the first scan; None: anywhere.
 
-    Raises StereovoxError for a start outside of the map, and as `Localiser`.
+    Raises StereovoxError for a start outside the map, and as `Localiser`.
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None):
@@ -87,9 +87,9 @@ class MapLocalization(Localization):
         )  # fmt: skip
 
     def place(self, pose: se2.Pose | None, std: ArrayLike | None = None) -> None:
-        """Take the robot to be at a pose (3,) with the next scan; None: anywhere. Particles so far are forgotten.
+        """Assume that the robot is at a pose (3,) at the next scan; None: anywhere. Earlier particles are discarded.
 
-        std: (3,) metres, metres, radians; None: `amcl.start_std`. Raises StereovoxError for a pose outside of the map.
+        std: (3,) metres, metres, radians; None: `amcl.start_std`. Raises StereovoxError for a pose outside the map.
         """
         check_start(pose, self._grid)
         config = self._config
@@ -98,7 +98,7 @@ class MapLocalization(Localization):
         self._localiser = Localiser(self._grid, config, pose)
 
     def restart(self) -> None:
-        """Begin again at the first start."""
+        """Start again at the first start pose."""
         self.place(self._start)
 
 
@@ -106,7 +106,7 @@ class SlamLocalization(Localization):
     """SLAM by the scans. Raises MissingExtra without gtsam, which loops need.
 
     Attributes:
-        bent: How often loops moved where the robot was before. Whatever was mapped at those poses is not moved.
+        bent: How often loops moved earlier poses of the robot. Anything mapped at those poses is not moved.
     """
 
     def __init__(self, config: Config):
@@ -125,7 +125,7 @@ class SlamLocalization(Localization):
         return Located(scan.stamp_ns, pose, pose_map_odom, None, None, len(self._slam.keyframes) > len(poses), True)
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map so far; None while there is none."""
+        """Return the map so far, None if there is no map yet."""
         return self._slam.grid()
 
     def finish(self) -> SlamResult | None:
@@ -144,14 +144,14 @@ class SlamLocalization(Localization):
 
 
 class LocalizedPoses(PoseBuffer):
-    """Poses by odometry, and by where the odometry's world is in the map, which scans tell (`correct`).
+    """Poses by odometry, and by the pose of the odometry's world in the map, which scans correct (`correct`).
 
     world: frame of the map; "": `map`. odom: frame of the odometry's world. Others: as for `PoseBuffer`.
 
     Attributes:
         odom: Frame of the odometry's world.
-        rival: Whether another node publishes the same transform: it is not used.
-        lost: Why the robot's place is not known at present; "": it is.
+        rival: Whether another node publishes the same transform, which is ignored.
+        lost: Why the robot's pose is unknown at present; "" if it is known.
     """
 
     def __init__(self, world: str, base: str, extrapolate_s: float, odom: str):
@@ -185,9 +185,9 @@ class LocalizedPoses(PoseBuffer):
             raise error
 
     def correct(self, stamp_ns: int, T_map_odom: Transform) -> None:
-        """Take in where the odometry's world is in the map, (4, 4).
+        """Set the pose of the odometry's world in the map, (4, 4).
 
-        Where it was not known any more, what was said before is given up: between both there is no pose.
+        If the robot was lost, earlier values are discarded, so that nothing is interpolated across the gap.
         """
         if self.lost:
             self.tf.forget(self.world, self.odom)
@@ -196,7 +196,7 @@ class LocalizedPoses(PoseBuffer):
         super()._add(StampedTransform(stamp_ns, self.world, self.odom, numbers))
 
     def published(self, stamp_ns: int) -> None:
-        """Remember that the transform was published with a stamp: it comes back on /tf."""
+        """Remember the stamp of a published transform, which comes back on /tf."""
         self._own.append(stamp_ns)
 
     def _add(self, one: StampedTransform, fixed: bool = False) -> None:
@@ -207,18 +207,18 @@ class LocalizedPoses(PoseBuffer):
 
 
 class Localizer:
-    """Localises scan by scan, and tells `poses` and `told` about it.
+    """Localises scan by scan; corrects `poses` and calls `located`.
 
     Attributes:
         poses: The poses that it corrects.
-        localization: How it is done.
+        localization: The method.
         used: Number of scans.
         refused: Refused scans by reason.
     """
 
-    def __init__(self, localization: Localization, poses: LocalizedPoses, told: Callable[[Located], None],
+    def __init__(self, localization: Localization, poses: LocalizedPoses, located: Callable[[Located], None],
                  log: Callable[[str], object] = lambda text: None):  # fmt: skip
-        self.localization, self.poses, self._told, self._log = localization, poses, told, log
+        self.localization, self.poses, self._located, self._log = localization, poses, located, log
         self.used, self.refused = 0, Counter[str]()
         self._last_ns: int | None = None
 
@@ -233,7 +233,7 @@ class Localizer:
             if scan.fault:
                 raise FrameRefused(scan.fault, scan.fault_detail)
             if self._last_ns is not None and scan.stamp_ns < self._last_ns - RESET_NS:
-                self._log("stamps went back: localisation begins again")
+                self._log("stamps went back: localisation starts again")
                 self.localization.restart()
                 self._last_ns = None
             found = self.localization.add(scan)
@@ -245,21 +245,19 @@ class Localizer:
         return found
 
     def forget(self) -> None:
-        """Treat the place as unknown until a scan tells it."""
-        self.poses.lost = "the next scan will tell where it is"
+        """Treat the pose as unknown until the next scan."""
+        self.poses.lost = "the next scan will localise it"
 
     def _take(self, found: Located) -> None:
         if found.settled:
             self.poses.correct(found.stamp_ns, se2.lifted(found.pose_map_odom))
         else:
-            self.poses.lost = (
-                "the robot may be in several places of the map; drive on, or tell where it is (/initialpose)"
-            )
-        self._told(found)
+            self.poses.lost = "the robot may be in several places of the map; keep driving, or publish /initialpose"
+        self._located(found)
 
 
 class LocalizingScanInput(ScanInput):
-    """Scans by which the robot is localised. mapped: whether they enter the map as well."""
+    """Scans by which the robot is localised. mapped: whether they enter the map too."""
 
     def __init__(self, topic: str, localizer: Localizer, mapped: bool):
         super().__init__(topic)
@@ -270,7 +268,7 @@ class LocalizingScanInput(ScanInput):
         return self._localizer.poses.odometry_is_final(frame_id, stamp_ns)
 
     def look_up(self, poses: PoseBuffer) -> PoseLookup:
-        """Return what looks poses up in the odometry's world."""
+        """Return the function that looks poses up in the odometry's world."""
         return self._localizer.poses.odometry
 
     def frame(self, data: bytes, where: PoseLookup) -> Scan | None:

@@ -21,11 +21,11 @@ POSE, PARTICLES, INITIAL, ANYWHERE = "amcl_pose", "particlecloud", "initialpose"
 PLANE = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of ROS."""
 LEAST_STD = np.array([0.05, 0.05, 0.02])
-"""Least standard deviations in metres, metres and radians that an initial pose is taken to have."""
+"""Least standard deviations of an initial pose, in metres, metres and radians."""
 
 
 def pose_message(found: Located, frame_id: str) -> Any:
-    """Return a `geometry_msgs/PoseWithCovarianceStamped`: on the floor, covariance of x, y and yaw alone."""
+    """Return a `geometry_msgs/PoseWithCovarianceStamped`: on the floor, with covariance of x, y and yaw alone."""
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
     message = PoseWithCovarianceStamped(header=header(found.stamp_ns, frame_id))
@@ -54,18 +54,18 @@ def pose_of_message(message: Any) -> tuple[se2.Pose, NDArray[np.float64]]:
     pose = np.array([place.x, place.y, yaw])
     variances = np.reshape(message.pose.covariance, (6, 6))[PLANE].diagonal()
     if not (np.isfinite(pose).all() and abs(np.linalg.norm(quaternion) - 1) < 0.01):
-        raise StereovoxError(f"/{INITIAL}: its pose is none; send x, y in metres and a quaternion of length 1")
+        raise StereovoxError(f"/{INITIAL}: its pose is invalid; send x, y in metres and a quaternion of length 1")
     if not (np.isfinite(variances).all() and (variances >= 0).all()):
-        raise StereovoxError(f"/{INITIAL}: variances {variances.tolist()}; send none below 0")
+        raise StereovoxError(f"/{INITIAL}: variances {variances.tolist()}; send finite ones of at least 0")
     return pose, np.maximum(np.sqrt(variances), LEAST_STD)
 
 
 class LocationTopics:
-    """Publishes where the robot is, and takes in where others say it is.
+    """Publishes the robot's pose.
 
-    `/tf`: map -> odom, with each scan, dated `ros.tf_tolerance_s` ahead, as Nav2's AMCL does: who asks for the newest
-    pose then need not extrapolate. Nothing while the place is not known, or another node publishes the same; and no
-    topic has what is old. late: returns why what has a stamp is too old, "" if it is not.
+    `/tf`: map -> odom, with each scan, dated `ros.tf_tolerance_s` ahead, as Nav2's AMCL does: users of the newest pose
+    then need not extrapolate. It is silent while the pose is unknown, or while another node publishes the transform; no
+    topic gets old data. late: returns why data with a stamp are too old, "" if they are not.
     """
 
     def __init__(self, node: Any, poses: LocalizedPoses, options: Options, late: Late = never_late):
@@ -80,7 +80,7 @@ class LocationTopics:
             node.get_logger().warning(f"tf2_msgs is not installed: the pose is published on {POSE} alone, not on /tf")
 
     def publish(self, found: Located) -> None:
-        """Publish where the robot is after a scan."""
+        """Publish the robot's pose after a scan."""
         world = self._poses.world
         if old := self._late(found.stamp_ns):
             self._node.get_logger().error(f"{POSE}: not published, {old}", throttle_duration_sec=10.0)
@@ -92,7 +92,7 @@ class LocationTopics:
         if self._tf is None or not found.settled:
             return
         if self._poses.rival:
-            said = f"another node publishes {world} -> {self._poses.odom} on /tf: none is published from here; stop one"
+            said = f"another node publishes {world} -> {self._poses.odom} on /tf, so this one does not; stop one"
             self._node.get_logger().warning(said, throttle_duration_sec=30.0)
             return
         stamp_ns = found.stamp_ns + self._ahead_ns
@@ -119,10 +119,10 @@ class InitialPose:
             pose, std = pose_of_message(message)
             self._localization.place(pose, std)
         except StereovoxError as error:
-            self._log.warning(f"ignored: {error}")
+            self._log.warning(f"pose ignored: {error}")
             return
         self._localizer.forget()
-        self._log.info(f"the robot is taken to be at x {pose[0]:.2f} m, y {pose[1]:.2f} m")
+        self._log.info(f"the robot is assumed to be at x {pose[0]:.2f} m, y {pose[1]:.2f} m")
 
     def _anywhere(self, _: Any, response: Any) -> Any:
         self._localization.place(None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish where the robot is: odometry, and the transform of REP 105."""
+"""Publish the robot's pose: odometry, and the transform of REP 105."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ ROS_ORDER = np.r_[3:6, 0:3]
 """Rows of our covariances in the order of `geometry_msgs/PoseWithCovariance`: x, y, z, rotation about X, Y, Z."""
 Late = Callable[[int], str]
 UNKNOWN = 1e9
-"""Variance of what is not known: the speed."""
+"""Variance of the speed, which is unknown."""
 
 
 def never_late(stamp_ns: int) -> str:
-    """Return that nothing is known of how old a stamp is."""
+    """Return "", since the age of stamps is unknown."""
     return ""
 
 
 def odometry_message(moved: Moved) -> Any:
-    """Return a `nav_msgs/Odometry`; the covariance is along the axes of the frame in the header; no speed."""
+    """Return a `nav_msgs/Odometry` without speed; the covariance is along the axes of the frame in the header."""
     from nav_msgs.msg import Odometry
 
     message = Odometry(header=header(moved.stamp_ns, moved.world), child_frame_id=moved.body)
@@ -42,10 +42,10 @@ def odometry_message(moved: Moved) -> Any:
 
 
 class TransformPublisher:
-    """Publishes transforms on /tf, where `tf2_msgs` or its stand-in is there. node: rclpy's.
+    """Publishes transforms on /tf, if `tf2_msgs` or its stand-in is there. node: rclpy's.
 
     Attributes:
-        works: Whether it does.
+        works: Whether it can.
     """
 
     def __init__(self, node: Any):
@@ -54,15 +54,15 @@ class TransformPublisher:
         self._publisher = node.create_publisher(kind, "/tf", 100) if self.works else None
 
     def publish(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Publish where frame `child` is in `parent`, (4, 4)."""
+        """Publish the pose of frame `child` in `parent`, (4, 4)."""
         if self._publisher is not None:
             self._publisher.publish(packed_transforms(stamp_ns, [(parent, child, T_parent_child)]))
 
 
 class MotionPublisher:
-    """Publishes tracked poses, none that are old. node: rclpy's; with_tf: on /tf, too, unless another node does.
+    """Publishes tracked poses, unless they are old. node: rclpy's; with_tf: also on /tf, unless another node does.
 
-    late: returns why what has a stamp is too old, "" if it is not.
+    late: returns why data with a stamp are too old, "" if they are not.
     """
 
     def __init__(self, node: Any, with_tf: bool, late: Late = never_late):
@@ -84,8 +84,8 @@ class MotionPublisher:
             return
         if moved.rival:
             text = (
-                f"another node publishes {moved.rival} -> {moved.body} on /tf: none is published from here, and "
-                f"the map is in a frame {moved.world} of its own; use those poses (--poses given) or set ros.base_frame"
+                f"another node publishes {moved.rival} -> {moved.body} on /tf, so this one does not, and the map is in "
+                f"its own frame {moved.world}; use those poses (--poses given) or set ros.base_frame"
             )
             self._node.get_logger().warning(text, throttle_duration_sec=30.0)
         else:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the poses of the node come from: /tf and odometry, a tracked camera, or localisation by a lidar."""
+"""The node's sources of poses: /tf and odometry, a tracked camera, or localisation by a lidar."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses, Tracki
 from stereovox.runs.pose_choice import GIVEN, TRACK
 
 SLAM_MAP_S = 2.0
-"""Seconds between two maps of SLAM at least."""
+"""Least seconds between two maps of SLAM."""
 BENT = (
-    "SLAM has closed a loop: /map is right again, but what other topics mapped before stays where it was; "
+    "SLAM has closed a loop: /map is corrected, but earlier data of other topics stay at their old poses; "
     "call ~/reset, or save SLAM's map and localise in it (--poses MAP.yaml)"
 )
 
 
 class PoseSource(Protocol):
-    """Where poses come from.
+    """A source of poses.
 
     Attributes:
-        poses: What frames ask for their poses.
+        poses: The buffer in which frames look up their poses.
         continuable: Whether the map's frame is the same in each run, so that a saved map can be continued.
     """
 
@@ -60,7 +60,7 @@ class PoseSource(Protocol):
         """Publish what is due."""
 
     def finish(self) -> dict[str, Any]:
-        """End; return figures for the report."""
+        """Finish, and return figures for the report."""
         return {}
 
 
@@ -72,7 +72,7 @@ class GivenPoses(PoseSource):
 
 
 class CameraPoses(PoseSource):
-    """Poses by the images of the first depth camera."""
+    """Poses by visual odometry of the first depth camera."""
 
     continuable = False
 
@@ -93,7 +93,7 @@ class CameraPoses(PoseSource):
 
 
 class LidarPoses(PoseSource):
-    """Poses by localisation. The map that the robot is localised in is on `/map`."""
+    """Poses by localisation. The map in which the robot is localised is on `/map`."""
 
     def __init__(self, node: Any, config: Config, options: Options, late: Late):
         self.poses = LocalizedPoses(options.world_frame, options.base_frame, options.extrapolate_s, options.odom_frame)
@@ -101,7 +101,7 @@ class LidarPoses(PoseSource):
         self._topics = LocationTopics(node, self.poses, options, late)
         self._slam: SlamLocalization | None = None
         localization = self._slamming(config) if options.poses == SLAM else self._localising(node, config, options)
-        self._localizer = Localizer(localization, self.poses, self._told, self._log.warning)
+        self._localizer = Localizer(localization, self.poses, self._located, self._log.warning)
         if isinstance(localization, MapLocalization):
             InitialPose(node, self._localizer, localization)
         self.continuable = self._slam is None
@@ -156,7 +156,7 @@ class LidarPoses(PoseSource):
         self._server.show(floor, node.get_clock().now().nanoseconds)
         return found
 
-    def _told(self, found: Located) -> None:
+    def _located(self, found: Located) -> None:
         self._topics.publish(found)
         if self._slam is not None and self._slam.bent > self._bent:
             self._bent = self._slam.bent
@@ -165,7 +165,7 @@ class LidarPoses(PoseSource):
 
 
 def pose_source(node: Any, config: Config, options: Options, late: Late = never_late) -> PoseSource:
-    """Return where poses come from. late: returns why what has a stamp is too old to be published, "" if it is not.
+    """Return the source of poses. late: returns why data with a stamp are too old to publish, "" if they are not.
 
     Raises StereovoxError, one line, for a bad map or start, MissingExtra for gtsam.
     """

@@ -24,11 +24,11 @@ from stereovox.sources.poses.poses import Poses, seconds_from_ns
 from stereovox.sources.robots.frames import BASES
 
 MAX_TRANSFORMS = 2000
-"""Transforms kept per frame; the older half is dropped when there are more."""
+"""Most transforms kept per frame; when there are more, the older half is dropped."""
 
 
 class _Late(NamedTuple):
-    """A transform that is older than one before it, and when it came."""
+    """A transform that is older than an earlier one, and when it arrived."""
 
     stamp_ns: int
     numbers: tuple[float, ...]
@@ -36,17 +36,17 @@ class _Late(NamedTuple):
 
 
 class LiveEdge(Edge):
-    """Recent poses of a frame in its parent; one thread may add some while others ask.
+    """Recent poses of a frame in its parent; one thread may add some while others look them up.
 
     arrived: returns when the transform that is added arrived, monotonic. simulated: as for `Pace`.
 
     A frame that has not moved may still move: unlike in a recording, it is never treated as fixed.
 
-    A clock that is set back by little shows as in `LivePoses`: transforms older than the newest one go on as time
-    passes. Then those before from their times on are dropped; two clocks are never mixed.
+    A clock that is set back a little shows as in `LivePoses`: transforms older than the newest one advance with time.
+    Then all earlier transforms with later stamps are dropped; two clocks are never mixed.
 
     Attributes:
-        pace: How its transforms arrive.
+        pace: The pace of its transforms.
     """
 
     def __init__(self, parent: str, child: str, arrived: Callable[[], int] = monotonic_ns, simulated: bool = False):
@@ -76,7 +76,7 @@ class LiveEdge(Edge):
             self._late, self._newest_ns, self._sorted = [], None, None
 
     def stamps(self, first_ns: int, last_ns: int) -> list[int]:
-        """Return the times of the transforms in a stretch of time, with one more at either end."""
+        """Return the times of the transforms in a span of time, with one more at either end."""
         stamps, _ = self._in_order()
         begin = max(int(np.searchsorted(stamps, first_ns)) - 1, 0)
         return stamps[begin : int(np.searchsorted(stamps, last_ns)) + 1].tolist()
@@ -95,7 +95,7 @@ class LiveEdge(Edge):
 
     def _put_late(self) -> None:
         late, self._late = self._late, []
-        for one in late:  # of two with one time the first counts
+        for one in late:  # of two with the same time the first counts
             self._put(one)
 
     def _put(self, one: _Late) -> None:
@@ -127,8 +127,8 @@ class LiveTf(Tf):
     """Transforms between the frames of a running robot.
 
     Attributes:
-        arrived_ns: When the message that is read arrived, monotonic; None: now.
-        simulated: As for `Pace`; counts for frames that come later.
+        arrived_ns: When the message being read arrived, monotonic; None: now.
+        simulated: As for `Pace`; applies to frames that appear later.
     """
 
     arrived_ns: int | None = None
@@ -141,7 +141,7 @@ class LiveTf(Tf):
         edge.clear()
 
     def mover(self, target: str, source: str) -> LiveEdge | None:
-        """Return what moves next to `source`; None if nothing moves or connects them."""
+        """Return the moving edge nearest to `source`; None if nothing moves or connects the frames."""
         try:
             up, down = self._path(frame_name(target), frame_name(source))
         except FrameRefused:
@@ -164,14 +164,14 @@ class Pose(NamedTuple):
 
 
 class SensorPoses:
-    """Poses of a frame in the world as they come; raises FrameRefused if one would be extrapolated."""
+    """Poses of a frame in the world as they arrive; raises FrameRefused instead of extrapolating."""
 
     def __init__(self, poses: PoseBuffer, frame_id: str):
         self._poses, self._frame_id = poses, frame_id
 
     @property
     def pace(self) -> Pace | None:
-        """How their messages arrive; None while nothing moves the frame."""
+        """The pace of their messages; None while nothing moves the frame."""
         return self._poses.pace(self._frame_id)
 
     def at(self, stamp_ns: int) -> Transform:
@@ -182,7 +182,7 @@ class SensorPoses:
         return pose.T_world_sensor
 
     def between(self, first_ns: int, last_ns: int) -> Poses | None:
-        """Return the poses of a stretch of time, with one more at either end; None if there are fewer than two."""
+        """Return the poses in a span of time, with one more at either end; None if there are fewer than two."""
         mover, found = self._poses.mover(self._frame_id), dict[int, Transform]()
         for stamp_ns in mover.stamps(first_ns, last_ns) if mover else ():
             with suppress(FrameRefused):
@@ -193,7 +193,7 @@ class SensorPoses:
 class PoseBuffer:
     """Receives messages as CDR bytes and looks up poses.
 
-    world, base: frames of the map and of the robot; "": the first of the usual ones to appear, which is then kept.
+    world, base: frames of the map and of the robot; "": the first usual one that appears, which is then kept.
     extrapolate_s: seconds by which a pose may be extrapolated.
     """
 
@@ -246,14 +246,14 @@ class PoseBuffer:
         return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
 
     def mover(self, frame_id: str) -> LiveEdge | None:
-        """Return what moves a frame in the world; None if it is not known."""
+        """Return the edge that moves a frame in the world; None if it is unknown."""
         try:
             return self.tf.mover(self._world_of(frame_id), frame_id)
         except FrameRefused:
             return None
 
     def pace(self, frame_id: str) -> Pace | None:
-        """Return how the poses of a frame in the world arrive; None if it is not known."""
+        """Return the pace of the poses of a frame in the world; None if it is unknown."""
         mover = self.mover(frame_id)
         return mover.pace if mover else None
 

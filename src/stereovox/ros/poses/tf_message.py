@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`tf2_msgs/TFMessage` as bytes: packed by hand, and with a type support made here where the package is not installed.
+"""`tf2_msgs/TFMessage` as bytes: packed by hand, with a type support made here if the package is not installed.
 
-`tf2_msgs` is not on PyPI. rclpy sends and receives bytes, and of a type's support it then needs no more than name,
-hash and description: these are filled into a copy of the support of `geometry_msgs/TransformStamped`, whose C structs
-are those of the headers that the wheels bring (`rosidl_runtime_c/message_type_support_struct.h`,
+`tf2_msgs` is not on PyPI. rclpy sends and receives bytes, for which it needs only the name, hash and description of a
+type's support: these are filled into a copy of the support of `geometry_msgs/TransformStamped`, whose C structs follow
+the headers in the wheels (`rosidl_runtime_c/message_type_support_struct.h`,
 `rosidl_typesupport_fastrtps_cpp/message_type_support.h`, `rosidl_typesupport_introspection_c/message_introspection.h`).
-So it is done with the versions of the extra `ros2` alone.
+So it works only with the versions of the extra `ros2`.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ VERSIONS = {
     "ros-rosidl-typesupport-fastrtps-c": "3.8.",
     "ros-rosidl-typesupport-introspection-c": "4.9.",
 }
-"""Wheels whose C structs are known, by the beginnings of their versions."""
+"""Wheels whose C structs are known, with the prefixes of their versions."""
 MIDDLEWARE = "rmw_fastrtps_cpp"
 CALLBACKS, MEMBERS = b"rosidl_typesupport_fastrtps_c", b"rosidl_typesupport_introspection_c"
-"""Type supports by their identifiers: functions for bytes, which are not called, and what a message consists of."""
+"""Identifiers of type supports: functions for bytes, which are not called, and the members of a message."""
 MESSAGE, SEQUENCE_BYTES = 18, 24
 """`ROS_TYPE_MESSAGE` of rosidl_typesupport_introspection_c, and the size of a sequence in C."""
 NESTED_SEQUENCE = 145
@@ -75,7 +75,7 @@ def packed_transforms(stamp_ns: int, transforms: Iterable[tuple[str, str, Transf
 
 @cache
 def tf_message() -> Any | None:
-    """Return the class of `tf2_msgs/TFMessage`: the package's, else one for bytes alone; None if neither is there.
+    """Return the class of `tf2_msgs/TFMessage`: the package's, else one for bytes only; None if neither is available.
 
     With the latter a publisher takes `packed_transforms`, and a subscription must be `raw=True`.
     """
@@ -158,7 +158,7 @@ class _Support(Structure):
 
 
 def _made() -> Any:
-    """Return a class that rclpy takes for `tf2_msgs/TFMessage` where messages are bytes."""
+    """Return a class that rclpy accepts as `tf2_msgs/TFMessage` if messages are bytes."""
     from geometry_msgs.msg import TransformStamped
 
     kind: Any = type(TransformStamped)
@@ -168,13 +168,13 @@ def _made() -> Any:
     capsule = python.PyCapsule_New
     capsule.restype, capsule.argtypes = py_object, [c_void_p, c_char_p, c_void_p]
     others = ("_CREATE_ROS_MESSAGE", "_CONVERT_FROM_PY", "_CONVERT_TO_PY", "_DESTROY_ROS_MESSAGE")
-    members = {one: getattr(kind, one) for one in others}  # rclpy asks for them, and calls none of them for bytes
+    members = {one: getattr(kind, one) for one in others}  # rclpy reads them, but calls none of them for bytes
     members |= {"_TYPE_SUPPORT": capsule(addressof(support), None, None), "_kept": (support, kept)}
     return type("MetaclassTFMessage", (type,), members)("TFMessage", (), {"__module__": "tf2_msgs.msg"})
 
 
 def _support(capsule: Any) -> tuple[_Support, list[Any]]:
-    """Return the type support of TFMessage, and what must live as long. capsule: support of TransformStamped."""
+    """Return the type support of TFMessage, and objects to keep alive with it. capsule: support of TransformStamped."""
     content = python.PyCapsule_GetPointer
     content.restype, content.argtypes = c_void_p, [py_object, c_char_p]
     element = _Support.from_address(content(capsule, None))
@@ -198,7 +198,7 @@ def _returning(address: int) -> Any:
 
 
 def _described(element: _Description) -> tuple[_Description, list[Any]]:
-    """Return the description of TFMessage, a sequence `transforms` of `element`, and what must live as long."""
+    """Return the description of TFMessage, a sequence `transforms` of `element`, and objects to keep alive with it."""
     fields = (_Field * 1)(
         _Field(_string(b"transforms"), NESTED_SEQUENCE, 0, 0, element.type_description.type_name, _string(b""))
     )

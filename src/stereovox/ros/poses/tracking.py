@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses without tf: one depth camera is tracked by its own images, and all sensors have their poses by it."""
+"""Poses without tf: one depth camera is tracked by visual odometry, and all sensors get their poses from it."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from stereovox.track.stream import posed
 from stereovox.track.tracker import Tracker
 
 WORLD = WORLDS[1]
-"""Frame of the map unless another is named: poses drift, as REP 105 expects of it."""
+"""Frame of the map unless another is named: its poses may drift, by REP 105."""
 ECHOES = 200
-"""Own transforms that are remembered, to know them again on /tf."""
+"""Most own transforms that are remembered, to recognise them on /tf."""
 
 
 class Moved(NamedTuple):
-    """Where the robot is.
+    """The pose of the robot.
 
     world, body: names of frames. T_world_body: (4, 4). covariance: (6, 6) of that, rotation about the body in radians,
-    then position in metres, along the world's axes. rival: frame that another node names as the body's parent, or "".
+    then position in metres, along the world's axes. rival: the body's parent frame by another node, or "".
     """
 
     stamp_ns: int
@@ -46,17 +46,17 @@ class Moved(NamedTuple):
 
 
 class TrackedPoses(PoseBuffer):
-    """Poses by those of one tracked camera: transforms tell how sensors are mounted on the robot, and no more.
+    """Poses from one tracked camera: transforms only give the mounts of sensors on the robot.
 
-    world: frame of the map; "": `odom`. base: frame of the robot; "": `base_footprint` or `base_link`, if the camera
-    is mounted on one of them, else the frame that carries the camera. extrapolate_s: as for `PoseBuffer`.
+    world: frame of the map; "": `odom`. base: frame of the robot; "": `base_footprint` or `base_link`, if the camera is
+    mounted on one of them, else the frame that carries the camera. extrapolate_s: as for `PoseBuffer`.
     base_needed: refuse frames of a camera that is not mounted on a robot's frame.
 
     Attributes:
         body: The frame whose poses are tracked; "" until the first frame decides it.
         on_robot: Whether that is a robot's frame, which is level at the start.
-        rival: Another node's parent of that frame; "" without.
-        images: How those of the camera arrive, by whose stamps poses are.
+        rival: The parent of that frame by another node; "" without one.
+        images: The pace of the camera's images, whose stamps the poses have.
     """
 
     def __init__(self, world: str, base: str, extrapolate_s: float, base_needed: bool = False):
@@ -64,11 +64,11 @@ class TrackedPoses(PoseBuffer):
         self.body = self.rival = ""
         self.on_robot = False
         self._base_needed, self.images = base_needed, Pace()
-        self._way = LiveEdge(self.world, "")
+        self._track = LiveEdge(self.world, "")
         self._own: deque[int] = deque(maxlen=ECHOES)
 
     def is_mounted(self, frame_id: str, stamp_ns: int) -> bool:
-        """Return whether it is known, and for good, where a camera sits on the robot."""
+        """Return whether the mount of a camera on the robot is known and final."""
         body = self.body or self._robot(frame_id)
         if not body:
             return False
@@ -78,45 +78,45 @@ class TrackedPoses(PoseBuffer):
             return False
 
     def mount(self, frame_id: str, stamp_ns: int) -> Transform:
-        """Return T_body_sensor (4, 4), and decide at the first call which frame the body is.
+        """Return T_body_sensor (4, 4); the first call decides which frame is the body.
 
         Raises FrameRefused `no_pose` if the camera is not mounted on it.
         """
         robot = self._robot(frame_id)
         if not (self.body or robot) and self._base_needed:
             cure = f"give --fixed 'base_link {frame_id} x y z yaw pitch roll'"
-            raise FrameRefused("no_pose", f"a floor map needs to know how high {frame_id} is on the robot; {cure}")
+            raise FrameRefused("no_pose", f"a floor map needs the height of {frame_id} on the robot; {cure}")
         body = self.body or robot or self._carrier(frame_id)
         T_body_sensor = np.eye(4) if body == frame_id else self.tf.lookup(body, frame_id, stamp_ns)
         if not self.body:
-            self.body, self.on_robot, self._way = body, bool(robot), LiveEdge(self.world, body)
+            self.body, self.on_robot, self._track = body, bool(robot), LiveEdge(self.world, body)
             self.rival = self.tf.parent(body)
         return T_body_sensor
 
     def move(self, stamp_ns: int, T_world_body: Transform) -> None:
-        """Take in where the body is."""
+        """Add a pose of the body."""
         numbers = (*T_world_body[:3, 3], *Rotation.from_matrix(T_world_body[:3, :3]).as_quat())
-        self._way.add(stamp_ns, numbers)
+        self._track.add(stamp_ns, numbers)
         self._own.append(stamp_ns)
 
     def is_final(self, frame_id: str, stamp_ns: int) -> bool:
         """Return whether the pose of a sensor at a time is final."""
-        return self._way.count > 0 and self._way.off_ns(stamp_ns) == 0 and self.is_mounted(frame_id, stamp_ns)
+        return self._track.count > 0 and self._track.off_ns(stamp_ns) == 0 and self.is_mounted(frame_id, stamp_ns)
 
     def pose(self, frame_id: str, stamp_ns: int) -> Pose:
         """Return the pose of a sensor on the robot; raises FrameRefused `no_pose`."""
-        if not self._way.count:
-            raise FrameRefused("no_pose", f"no image has been tracked yet, so it is not known where {frame_id} is")
+        if not self._track.count:
+            raise FrameRefused("no_pose", f"no image has been tracked yet, so the pose of {frame_id} is unknown")
         T_body_sensor = self.mount(frame_id, stamp_ns)
-        T_world_sensor = self._way.at(stamp_ns, self.tf.limits, "tracked") @ T_body_sensor
-        return Pose(T_world_sensor, T_body_sensor, self._way.off_ns(stamp_ns))
+        T_world_sensor = self._track.at(stamp_ns, self.tf.limits, "tracked") @ T_body_sensor
+        return Pose(T_world_sensor, T_body_sensor, self._track.off_ns(stamp_ns))
 
     def mover(self, frame_id: str) -> LiveEdge | None:
-        """Return what the tracked poses are kept in."""
-        return self._way
+        """Return the edge that holds the tracked poses."""
+        return self._track
 
     def pace(self, frame_id: str) -> Pace | None:
-        """Return how the images arrive that poses come from."""
+        """Return the pace of the tracked images."""
         return self.images
 
     def _add(self, one: StampedTransform, fixed: bool = False) -> None:
@@ -131,7 +131,7 @@ class TrackedPoses(PoseBuffer):
         return base if base != frame_id or frame_id == self._base else ""
 
     def _carrier(self, frame_id: str) -> str:
-        """Return the frame that carries a camera: of those that do not move in each other the highest."""
+        """Return the frame that carries a camera: the highest one that is fixed to it."""
         frame = frame_id
         while (parent := self.tf.parent(frame)) and not self.tf.moving(parent, frame):
             frame = parent
@@ -141,12 +141,12 @@ class TrackedPoses(PoseBuffer):
 class Tracking:
     """Tracks one camera, frame by frame.
 
-    config: settings of the map. moved: called with each pose that was found.
+    config: settings of the map. moved: called with each tracked pose.
 
     Attributes:
         tracked: Number of frames that were tracked.
-        lost: Number of those that were not.
-        state: `waiting`, `tracked`, or `lost: ` and why.
+        lost: Number of frames in which tracking was lost.
+        state: `waiting`, `tracked`, or `lost: ` and the cause.
     """
 
     def __init__(self, config: Config, poses: TrackedPoses, moved: Callable[[Moved], None] = lambda moved: None):
@@ -156,12 +156,12 @@ class Tracking:
         self._T_body_sensor = np.eye(4)
 
     def mounted(self, frame_id: str, stamp_ns: int) -> Pose:
-        """Return how the camera is mounted; its place in the world is not known yet. Raises FrameRefused `no_pose`."""
+        """Return the camera's mount, with an unknown pose in the world. Raises FrameRefused `no_pose`."""
         self._T_body_sensor = self.poses.mount(frame_id, stamp_ns)
         return Pose(np.eye(4), self._T_body_sensor, 0)
 
     def track(self, frame: Frame) -> Frame:
-        """Return a frame, converted with `mounted`, with its tracked pose, or with the fault `tracking_lost`."""
+        """Return a frame that was converted with `mounted`, now with its tracked pose or the fault `tracking_lost`."""
         if frame.fault:
             self.lost, self.state = self.lost + 1, f"lost: {frame.fault_detail}"
             return frame
@@ -172,14 +172,14 @@ class Tracking:
         self.state = f"lost: {tracked.lost}" if tracked.lost else "tracked"
         if not tracked.lost:
             self._move(frame.stamp_ns, tracked.T_world_sensor, tracked.covariance)
-        return posed(frame, tracked)  # pyright: ignore[reportReturnType] - of the kind that was given
+        return posed(frame, tracked)  # pyright: ignore[reportReturnType] - it keeps the type of the frame
 
     def counts(self) -> Mapping[str, object]:
         """Return values for diagnostics."""
         return {"tracking": self.state, "frames_tracked": self.tracked, "frames_lost": self.lost}
 
     def _start(self, frame: Frame) -> Transform:
-        """Return where the camera is in the beginning: the robot is level at the origin, or the floor in view is."""
+        """Return the camera's first pose: the robot is level at the origin, or the floor in view is level."""
         if self.poses.on_robot:
             return level_world(self._config) @ self._T_body_sensor
         return level_pose(frame, self._config)
@@ -203,16 +203,16 @@ class TrackedDepthInput(DepthInput):
         return self._tracking.track(super().frame(data, where))
 
     def look_up(self, poses: PoseBuffer) -> PoseLookup:
-        """Return what reports how the camera is mounted."""
+        """Return the function that gives the camera's mount."""
         return self._tracking.mounted
 
     def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
-        """Return whether it is known how the camera is mounted."""
+        """Return whether the camera's mount is known."""
         return self._tracking.poses.is_mounted(frame_name(frame_id), stamp_ns)
 
 
 def moved_covariance(covariance: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a point that is carried along, `offset` (3,) metres away along the world's axes.
+    """Return the covariance (6, 6) of a rigidly attached point, `offset` (3,) metres away along the world's axes.
 
     Rotation in radians, then position in metres, along the world's axes.
     """

@@ -4,8 +4,8 @@
 
 Written next to nav2_params.yaml by `stereovox ros2 --write-nav2 FOLDER`. Nav2's own map_server and AMCL are not
 started: with `poses:=MAP.yaml lidar:=/scan` stereovox serves the map and localises the robot in it; with `poses:=given`
-somebody else publishes map -> odom. Nav2's servers run in one container with `use_composition:=True`; the mapping node
-is a Python process, which no container can hold. Include this file in another one with the same arguments.
+another node publishes map -> odom. Nav2's servers run in one container with `use_composition:=True`; the mapping node
+is a Python process, which no container can hold. Other launch files can include this one with the same arguments.
 """
 
 from pathlib import Path
@@ -39,7 +39,7 @@ PASSED_ON = ("namespace", "use_sim_time", "autostart", "params_file", "use_compo
 
 
 def generate_launch_description():
-    """Return what `ros2 launch` starts."""
+    """Return the description for `ros2 launch`."""
     container = Node(
         condition=IfCondition(LaunchConfiguration("use_composition")),
         package="rclcpp_components",
@@ -55,13 +55,13 @@ def generate_launch_description():
 
 
 def _mapping(context):
-    """Return the process of the mapping node; empty options are left out."""
+    """Return the process of the mapping node; empty options are omitted."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ("params_file", "use_sim_time", *OURS)}
     return [ExecuteProcess(cmd=mapping_command(given), sigterm_timeout="30", output="screen")]
 
 
 def mapping_command(given):
-    """Return the words that start the mapping node. given: values of the arguments by name."""
+    """Return the command that starts the mapping node. given: values of the arguments by name."""
     options = [word for name in OURS if given[name] for word in (f"--{name}", given[name])]
     parameters = ["--params-file", given["params_file"], "-p", f"use_sim_time:={given['use_sim_time']}"]
     return ["stereovox", "ros2", *options, "--ros-args", *parameters]

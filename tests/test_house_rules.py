@@ -23,14 +23,14 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 603,
-    "lines": 91_150,
+    "modules": 607,
+    "lines": 91_550,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 86,
     "lines of the laboratory": 12_850,
-    "words of README and docs": 48_150,
+    "words of README and docs": 38_300,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

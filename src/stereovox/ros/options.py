@@ -60,7 +60,7 @@ class Options:
     which their points are dropped, and beyond which they are no surfaces (0: no limit).
     corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: frame whose poses it holds; "":
     that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the path since the last one.
-    reliable: request reliable delivery of images. out: where to save the map; "": nowhere.
+    odom_frame: frame of the odometry. reliable: request reliable delivery of images. out: file for the map; "": none.
     """
 
     depth: tuple[str, ...] = ()

@@ -92,7 +92,7 @@ def _read_bag(arguments: Namespace) -> tuple[OccupancyGrid, str]:
 
 def _read_floor(arguments: Namespace) -> tuple[OccupancyGrid, str]:
     """Return a floor map and the mode to write it in: its own, so that no value is lost."""
-    from stereovox.formats.map_server import metadata_of, read_map_server
+    from stereovox.formats.map_server import metadata_of
 
     refuse_options(arguments, ["topic"], "a floor map has no topics")
     metadata = metadata_of(arguments.file)

@@ -40,7 +40,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--free",
         choices=("view", "rays", "box"),
         default="view",
-        help="free cells: all others in view of a frame (view), or only those that a lidar ray crosses (rays)",
+        help="free cells: all others in view of a frame (view), only those that a lidar ray crosses (rays), or all "
+        "others of the box around them (box: Valenti 2018, Table 8.1)",
     )
     parser.add_argument(
         "--box-margin", type=float, default=0.0, metavar="M", help="enlarge annotated boxes by this many metres (0)"

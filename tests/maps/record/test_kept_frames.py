@@ -326,7 +326,7 @@ def test_damaged_and_missing_images_are_told_when_they_are_needed(folder):
     with pytest.raises(MapFileError, match="damaged"):
         loaded.kept_frames.frames[0].frame()
     pack.unlink()
-    with pytest.raises(MapFileError, match="load it again"):
+    with pytest.raises(MapFileError, match="reload it"):
         loaded.kept_frames.frames[1].frame()
 
 

@@ -124,7 +124,7 @@ def grid_file_is_silent(tmp=Path("/tmp")):
     file._write = lambda: said.append("written")
     file.after(*world.frames[-1])
     file.close()
-    return len(said) == 1 and "not written" in said[0]
+    return len(said) == 1 and "not updated" in said[0]
 
 
 def page_says_stale():

@@ -63,7 +63,7 @@ def test_millimetres_are_suspected(tmp_path, capsys):
     folder = write_boards(tmp_path / "boards", pinhole_eyes(), poses(0.5, 0.16, 3))
     words = ["--board", f"{BOARD.columns}x{BOARD.rows}", "--square", 1000 * BOARD.square, "--out", tmp_path / "r.toml"]
     assert run("calibrate", "stereo", folder, *words) == 0
-    assert "--square 40: millimetres?" in capsys.readouterr().err
+    assert "is --square 40 in millimetres?" in capsys.readouterr().err
     for apart, suspected in ((-3.6e2, False), (-3.6e5, True)):
         (tmp_path / "calib.txt").write_text(KITTI.replace("-3.6e+02", str(apart)))
         assert run("calibrate", "import", tmp_path / "calib.txt", "--out", tmp_path / "rig.toml") == 0

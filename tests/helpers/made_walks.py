@@ -35,12 +35,12 @@ def base_at(stamp_ns: int) -> Transform:
 
 
 def depth_at(k: int) -> Frame:
-    """Frame k: a wall across x = 3 m, a pole before it at x = 2 m."""
+    """Frame k: a wall across x = 2.1 m, a pole before it at x = 1.3 m."""
     stamp_ns = START_NS + k * FRAME_NS
     T = base_at(stamp_ns) @ T_BASE_CAMERA
     columns, rows = CAMERA.rays()
     across = np.stack(np.broadcast_arrays(columns, rows[:, :1], rows[:, 1:]), axis=-1) @ T[:3, :3].T
-    wall_m, pole_m = ((x - T[0, 3]) / across[..., 0] for x in (3.0, 2.0))
+    wall_m, pole_m = ((x - T[0, 3]) / across[..., 0] for x in (2.1, 1.3))
     pole = (pole_m > 0) & (abs(T[1, 3] + pole_m * across[..., 1]) < 0.08)
     depth = np.where(pole, pole_m, np.maximum(wall_m, 0))
     depth[0] = 0

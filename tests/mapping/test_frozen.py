@@ -11,9 +11,9 @@ from stereovox.config import load_config
 from stereovox.depth import DepthPipeline
 from stereovox.frame import CheckedCloud
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.mapping.frozen import FEW, FrozenViews, is_frozen, with_glance
+from stereovox.mapping.frozen import FEW, FrozenViews, is_frozen, jumped, with_glance
 from stereovox.maps.record.glance import binned
-from stereovox.maps.record.history import MAX_GLANCES
+from stereovox.maps.record.history import MAX_GLANCES, StampedPose
 from stereovox_lab.checks.bad_images import metres
 
 CONFIG = load_config(voxel_size=0.1)
@@ -26,10 +26,14 @@ def images():
     return [pipeline.image(frame) for frame in sv.open_source("sim:room?image_width=160&seed=5", frames=":40")]
 
 
+def at(T, stamp_ns=0):
+    return StampedPose(stamp_ns, tuple(T[:3].ravel().tolist()))
+
+
 def glances_of(images):
     found = ()
     for image in images:
-        found = with_glance(found, image.T_world_sensor, VIEWS.ranges(image))
+        found = with_glance(found, at(image.T_world_sensor, image.stamp_ns), VIEWS.ranges(image))
     return found
 
 
@@ -63,7 +67,7 @@ def test_points_are_counted_as_one_does_by_hand(images):
     blocks = np.random.default_rng(2).uniform(1, 3, (height // 20 + 1, width // 20 + 1))
     depth = np.kron(blocks, np.ones((20, 20)))[:height, :width].astype(np.float32)
     image = replace(images[0], depth_m=depth, T_world_sensor=np.eye(4))
-    glances = with_glance((), np.eye(4), VIEWS.ranges(image))
+    glances = with_glance((), at(np.eye(4)), VIEWS.ranges(image))
     aside = np.eye(4)
     aside[0, 3] = 0.25
     in_sensor, in_world = VIEWS.unmoved(glances, camera, aside, VIEWS.ranges(image))
@@ -84,19 +88,37 @@ def test_how_many_points_show_it(in_sensor, in_world, found):
 
 def test_glances_are_kept_from_poses_apart(images):
     T, ranges = images[0].T_world_sensor, VIEWS.ranges(images[0])
-    one = with_glance((), T, ranges)
-    assert with_glance(one, T, ranges) is one
+    one = with_glance((), at(T), ranges)
+    assert with_glance(one, at(T), ranges) is one
     ahead, turned = T.copy(), T.copy()
     ahead[:3, 3] += 0.11 * one[0].typical_m * T[:3, 2]
     turned[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0.15, 0])
-    assert len(with_glance(one, ahead, ranges)) == len(with_glance(one, turned, ranges)) == 2
+    assert len(with_glance(one, at(ahead), ranges)) == len(with_glance(one, at(turned), ranges)) == 2
     many = one
     for _ in range(2 * MAX_GLANCES):
         T = T.copy()
         T[:3, 3] += one[0].typical_m
-        many = with_glance(many, T, ranges)
+        many = with_glance(many, at(T), ranges)
     assert len(many) == MAX_GLANCES
     assert many[-1].pose == tuple(T[:3].ravel().tolist())
+
+
+@pytest.mark.parametrize(
+    ("step_m", "step_deg", "ms", "found"),
+    [(0.1, 0, 100, False), (0.6, 0, 100, True), (0.6, 0, 600, False), (0, 30, 100, True), (0, 2, 100, False)],
+)
+def test_a_pose_that_jumps_is_not_a_frozen_image(images, step_m, step_deg, ms, found):
+    """The sensor moved by 0.1 m in each 100 ms until then: 0.6 m in 600 ms are no jump."""
+    ranges = VIEWS.ranges(images[0])
+    T = images[0].T_world_sensor
+    before, now = T.copy(), T.copy()
+    before[0, 3] += 0.1
+    now[0, 3] += 0.1 + step_m
+    now[:3, :3] = T[:3, :3] @ rotation_matrix([0, np.radians(step_deg), 0])
+    glances = with_glance((), at(T), ranges)
+    assert jumped(glances, at(before, 10**8), at(now, 10**8 + ms * 10**6)) is found
+    assert not jumped(glances, at(before, 0), at(now, ms * 10**6))  # how fast it moved is unknown
+    assert not jumped((), at(before, 10**8), at(now, 10**9))
 
 
 def test_clouds_have_directions_too():

@@ -116,7 +116,7 @@ def test_without_gtsam_the_way_on_is_named(tmp_path, monkeypatch):
         raise MissingExtra("gtsam", "slam")
 
     monkeypatch.setattr("stereovox.runs.floor.slam_robot", closes_a_loop)
-    with pytest.raises(sv.StereovoxError, match=r"'stereovox\[slam\]'; or go on.*--poses odometry") as error:
+    with pytest.raises(sv.StereovoxError, match=r"'stereovox\[slam\]'; or continue.*--poses odometry") as error:
         sv.map_floor(DRIVE, tmp_path / "a.yaml", use="lidar")
     assert len(str(error.value)) <= 300
     assert sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR).map.frames

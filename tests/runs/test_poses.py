@@ -156,7 +156,7 @@ def test_a_live_camera_is_tracked_and_its_map_cannot_go_on(tmp_path):
     found, lines = mapped(Live(), tmp_path / "m.svox")
     assert (found.poses, found.map.frames) == ("track", 6)
     assert [line for line in lines if "?pose=fixed" in line]
-    with pytest.raises(StereovoxError, match="begin a new map"):
+    with pytest.raises(StereovoxError, match="begin a new one"):
         mapped(Live(), tmp_path / "m.svox", resume=True)
 
 

@@ -20,7 +20,7 @@ from stereovox.geometry.se3 import Transform, apart
 from stereovox.integrate.views import PerCamera, camera_rays
 from stereovox.maps.record._glance import SAME, SIDE, UNSEEN, bin_image, place
 from stereovox.maps.record.glance import AT_REST, Glance, binned, marks_of
-from stereovox.maps.record.history import MAX_GLANCES
+from stereovox.maps.record.history import MAX_GLANCES, StampedPose
 from stereovox.sensors.noise import RangeNoise
 
 SAMPLED = 4000
@@ -33,6 +33,8 @@ STEP, TURN = 0.1, np.radians(8)
 """A glance is kept once the sensor has moved by this share of the median distance in view, or turned by this angle."""
 NEAR, NEAR_TURN = 0.3, 0.4
 """Glances are compared up to this motion: from farther away, many points are unmoved by chance."""
+HASTE = 4
+"""Times the speed before that a step must have to be a jump of the pose."""
 FEW, TIMES = 20, 1.5
 """A frame is frozen if this many points are unmoved in the sensor alone, and this many times more than in the world."""
 
@@ -91,10 +93,25 @@ def is_frozen(in_sensor: int, in_world: int) -> bool:
     return in_sensor >= FEW and in_sensor > TIMES * in_world
 
 
-def with_glance(glances: tuple[Glance, ...], T: Transform, ranges: NDArray[np.float32]) -> tuple[Glance, ...]:
+def jumped(glances: tuple[Glance, ...], before: StampedPose, now: StampedPose) -> bool:
+    """Return whether the pose jumped after `before`, as a tracker does that corrects itself: the image did not move.
+
+    Its step is large, and HASTE times faster than the sensor moved from the last glance to `before`.
+    """
+    earlier = [glance for glance in glances if glance.stamp_ns < before.stamp_ns]
+    if not earlier or now.stamp_ns <= before.stamp_ns:
+        return False
+    last = earlier[-1]
+    share = (now.stamp_ns - before.stamp_ns) / (before.stamp_ns - last.stamp_ns)
+    least = STEP / 2 * last.typical_m, TURN / 2
+    steps = zip(apart(before.pose, now.pose), apart(last.pose, before.pose), least, strict=True)
+    return any(step >= large and step > HASTE * share * usual for step, usual, large in steps)
+
+
+def with_glance(glances: tuple[Glance, ...], now: StampedPose, ranges: NDArray[np.float32]) -> tuple[Glance, ...]:
     """Return the glances to keep after a frame: its own is added if it was taken elsewhere than the last one."""
     if glances:
-        metres, angle = apart(glances[-1].pose, tuple(T[:3].ravel().tolist()))
+        metres, angle = apart(glances[-1].pose, now.pose)
         if metres < STEP * glances[-1].typical_m and angle < TURN:
             return glances
-    return (*glances, Glance.of(ranges, T))[-MAX_GLANCES:]
+    return (*glances, Glance.of(ranges, now.pose, now.stamp_ns))[-MAX_GLANCES:]

@@ -17,7 +17,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
-from stereovox.mapping.frozen import FrozenViews, is_frozen, with_glance
+from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, with_glance
 from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.history import (
     MAX_NAME_LENGTH,
@@ -97,7 +97,7 @@ class Gate:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
             self._history.glances.pop(sensor, None)
         if self._trust.frozen and not isinstance(image, Scan):
-            return passed._replace(glances=self._glances(frame, sensor, image))
+            return passed._replace(glances=self._glances(frame, passed, image))
         return passed
 
     def in_doubt(self, passed: GateResult, against: float | None) -> bool:
@@ -163,17 +163,20 @@ class Gate:
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
 
-    def _glances(self, frame: AnyFrame | Scan, sensor: str, image: AnyImage) -> tuple[Glance, ...]:
+    def _glances(self, frame: AnyFrame | Scan, passed: GateResult, image: AnyImage) -> tuple[Glance, ...]:
         """Return the glances to keep. Raises FrameRefused for a frame that repeats a view from elsewhere."""
-        glances, ranges, T = self._history.glances.get(sensor, ()), self._views.ranges(image), image.T_world_sensor
-        in_sensor, in_world = self._views.unmoved(glances, image.camera, T, ranges)
+        glances, ranges = self._history.glances.get(passed.sensor, ()), self._views.ranges(image)
+        before = self._history.trusted.get(passed.sensor)
+        if before is None or jumped(glances, before, passed.seen):
+            return with_glance((), passed.seen, ranges)
+        in_sensor, in_world = self._views.unmoved(glances, image.camera, image.T_world_sensor, ranges)
         if is_frozen(in_sensor, in_world):
             detail = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
             raise FrameRefused(
                 "frozen_image",
                 f"{name_of(frame)}: it repeats a view from elsewhere ({detail}); restart the sensor",
             )
-        return with_glance(glances, T, ranges)
+        return with_glance(glances, passed.seen, ranges)
 
     def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one or is accepted again; refuse any other."""

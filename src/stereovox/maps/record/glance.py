@@ -28,21 +28,23 @@ class Glance(NamedTuple):
     """The view of a sensor at one time.
 
     pose: first three rows of T_world_sensor, 12 numbers. ranges: SIDE x SIDE float16 in metres as bytes, 0 for none.
+    stamp_ns: its time, 0 if it is not needed.
     """
 
     pose: tuple[float, ...]
     ranges: bytes
+    stamp_ns: int = 0
 
     @classmethod
     def at(cls, points: NDArray[np.float64], T_world_sensor: Transform) -> Glance:
         """Return the glance of points (N, 3) in the sensor's frame."""
-        return cls.of(binned(points), T_world_sensor)
+        return cls.of(binned(points), tuple(T_world_sensor[:3].ravel().tolist()))
 
     @classmethod
-    def of(cls, ranges: NDArray[np.float32], T_world_sensor: Transform) -> Glance:
+    def of(cls, ranges: NDArray[np.float32], pose: tuple[float, ...], stamp_ns: int = 0) -> Glance:
         """Return the glance with ranges (SIDE, SIDE) in metres, 0 for none."""
         packed = np.minimum(ranges, np.float32(6e4)).astype(np.float16)
-        return cls(tuple(T_world_sensor[:3].ravel().tolist()), packed.tobytes())
+        return cls(pose, packed.tobytes(), stamp_ns)
 
     @property
     def typical_m(self) -> float:
@@ -54,7 +56,7 @@ class Glance(NamedTuple):
         return b64encode(zlib.compress(self.ranges, 1)).decode()
 
     @classmethod
-    def unpacked(cls, pose: tuple[float, ...], text: str) -> Glance:
+    def unpacked(cls, pose: tuple[float, ...], text: str, stamp_ns: int = 0) -> Glance:
         """Return a saved glance. Raises ValueError if the text cannot be one."""
         try:
             ranges = zlib.decompressobj().decompress(b64decode(text, validate=True), 2 * SIDE * SIDE + 1)
@@ -63,7 +65,7 @@ class Glance(NamedTuple):
         metres = np.frombuffer(ranges, np.float16) if len(ranges) == 2 * SIDE * SIDE else np.full(1, np.nan)
         if not (np.isfinite(metres) & (metres >= 0)).all():
             raise ValueError("history: the ranges of a glance are not distances")
-        return cls(pose, ranges)
+        return cls(pose, ranges, stamp_ns)
 
     def votes(self, points: NDArray[np.float64], T_world_sensor: Transform, tolerance: NDArray[np.float64]) -> Votes:
         """Compare points (N, 3) in the sensor's frame, which a later frame saw, with this glance.

@@ -294,11 +294,12 @@ def _doubt_to(doubt: DisagreementSpell) -> dict[str, Any]:
 
 
 def _glance_to(glance: Glance) -> dict[str, Any]:
-    return {"pose": list(glance.pose), "ranges": glance.packed()}
+    return {"pose": list(glance.pose), "ranges": glance.packed(), "stamp_ns": glance.stamp_ns}
 
 
 def _glance_from(saved: Any) -> Glance:
-    return Glance.unpacked(_pose_from(saved["pose"]), saved["ranges"])
+    stamp_ns = _whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST)
+    return Glance.unpacked(_pose_from(saved["pose"]), saved["ranges"], stamp_ns)
 
 
 def _glances_from(saved: Any) -> tuple[Glance, ...]:

@@ -277,7 +277,7 @@ def _after_flight(config: Config, size: tuple[int, int, int], cell: Floats, move
         for axis in range(3 if moves else 0):  # 7.2.1: by whole cells, until the drone is in the middle again
             while abs(place[axis] - centre[axis] * cell[axis]) > cell[axis] / 2:
                 centre[axis] += 1 if place[axis] > centre[axis] * cell[axis] else -1
-        low, high = centre - half, centre - half + size
+        low, high = (centre - half).astype(int), (centre - half + size).astype(int)
         blocks = np.unique(rng.integers(low // 8 - 1, high // 8 + 1, (30, 3)), axis=0).astype(np.int32)
         values = np.zeros((len(blocks), 512), np.int16)
         values[:, [0, 219]] = 700  # cells (0, 0, 0) and (3, 3, 3) of each block
@@ -312,7 +312,7 @@ def local_map() -> list[Claim]:
 def metrics() -> list[Claim]:
     """Return the claims on Eq 8.1 to 8.9: a made-up map and truth, cell by cell."""
     rng, config = np.random.default_rng(9), load_config("valenti2018")
-    cells = np.stack(np.indices((9, 8, 7)), axis=-1).reshape(-1, 3)
+    cells = np.indices((9, 8, 7)).reshape(3, -1).T
     actual, seen = rng.random(len(cells)) < 0.3, rng.random(len(cells)) < 0.8
     p = np.clip(rng.normal(0.35 + 0.35 * actual, 0.2), 0.05, 0.95)
     truth = VoxelMap.from_cells(config, cells, np.where(actual, 3.0, -3.0))
@@ -350,7 +350,7 @@ def appendix_a() -> list[Claim]:
     points = origin + rng.uniform(-1, 5, (500, 3)) @ q.T
     own = (points - origin) @ q
     corners = (origin, *(origin + size[i] * q[:, i] for i in range(3)))
-    twin = ((own >= 0) & (own <= size)).all(axis=1)
+    twin = np.asarray(((own >= 0) & (own <= size)).all(axis=1), bool)
     return [same_cells("Eq A.1 to A.3: points in an annotated box", lidar_truth.inside(points, corners), twin)]
 
 

@@ -78,7 +78,7 @@ def test_up_is_found_in_any_world(tmp_path, seed):
         assert settings["up"] == found.up.axis or (found.up.axis == "z" and "up" not in settings)
     else:
         assert "up" not in settings
-        assert "not certain" in lines[0]
+        assert "uncertain" in lines[0]
 
 
 def test_a_camera_that_looks_straight_down_does_not_take_its_way_for_up(tmp_path):

@@ -168,7 +168,7 @@ def camera() -> PinholeCamera:
 
 def dense(voxel_map: VoxelMap, low: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the map's bytes (100, 30, 100) from cell `low` on."""
-    centres = (np.stack(np.indices(SHAPE), axis=-1).reshape(-1, 3) + low + 0.5) * CELL
+    centres = (np.indices(tuple(map(int, SHAPE))).reshape(3, -1).T + low + 0.5) * CELL
     return voxel_map.storage.stored_at(centres).astype(np.int64).reshape(SHAPE)
 
 
@@ -297,7 +297,7 @@ def appendix_a() -> list[Claim]:
     rows = slice(0, HEIGHT, 60)
     Z = np.tile(z, (HEIGHT, 1))
     y = (np.arange(HEIGHT) - (HEIGHT - 1) / 2) / FOCAL
-    X, Y = (np.broadcast_to(one, Z.shape)[rows, ::8].ravel() for one in (x, y[:, None]))
+    X, Y = (np.broadcast_to(one, Z.shape)[rows, ::8].ravel().astype(float) for one in (x, y[:, None]))
     fitted = fit("thesis", [Points(X, Y, 1 / Z[rows, ::8].ravel(), true, True)])
     depth = Z.astype(np.float32)
     correct(depth, replace(at, correction=fitted))

@@ -162,7 +162,7 @@ def _taken(mapper: GridMapper, seen: Any) -> None:
 
 def _seen(mapper: GridMapper) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return log-odds and states (600, 600) of the map's cells round the camera."""
-    places = (np.stack(np.indices((AROUND, AROUND)), axis=-1).reshape(-1, 2) - AROUND // 2 + 0.5) * CELL
+    places = (np.indices((AROUND, AROUND)).reshape(2, -1).T - AROUND // 2 + 0.5) * CELL
     shape = AROUND, AROUND
     return mapper.map.log_odds(places).reshape(shape), mapper.map.state(places).reshape(shape)
 

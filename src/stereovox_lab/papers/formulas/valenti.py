@@ -233,7 +233,9 @@ def map_claims() -> list[Claim]:
         v, u = np.nonzero((z >= 0.5) & (z <= 20))
         z = z[v, u]
         x, y = (u - (WIDTH - 1) / 2) / FOCAL * z, (v - (HEIGHT - 1) / 2) / FOCAL * z
-        ranges = {cell: summary(rhos) for cell, rhos in sphere_cells(np.stack([z, -x, -y], axis=1)).items()}
+        ranges = {
+            cell: summary(rhos) for cell, rhos in sphere_cells(np.stack([z, -x, -y], axis=1).astype(float)).items()
+        }
         for cell, said in evidence(eye, TURN @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]), ranges).items():
             kept[cell] = min(max(kept.get(cell, 0) + said, -MOST), MOST)
             hits |= {cell} if said > 0 else set()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_threads import CAMERA, frames_of, scans_of
+from made_threads import CAMERA, MOVING, frames_of, scans_of
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
@@ -56,7 +56,7 @@ class CountingLock(MapLock):
 
 
 def mapped(**settings):
-    mapper = sv.Mapper(voxel_size=0.2, **{"map.keep_times": True, **settings})
+    mapper = sv.Mapper(voxel_size=0.2, **{"map.keep_times": True, **MOVING, **settings})
     for frame in frames_of(0, 4):
         mapper.add(frame)
     return mapper

@@ -44,7 +44,7 @@ def test_one_thing_is_not_many(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "1 frame of 1 recording\n" in said
     assert "at least 1 box of 51.2 m" in said
-    assert "1 frame, each in 1.0 of 1 box, 1 of which was mapped now" in said
+    assert "1 frame, each in 1.0 of 1 box on average; 1 of these was mapped now" in said
 
 
 def test_a_plan_writes_nothing(tmp_path, capsys):

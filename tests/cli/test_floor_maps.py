@@ -130,7 +130,7 @@ def test_the_map_s_own_picture_is_not_written_over(folder, capsys):
     ("words", "said"),
     [
         (["eval", "space.svox", "reference.yaml"], "stereovox export space.svox floor.yaml"),
-        (["eval", "reference.yaml", "space.svox"], "space.svox: no floor's map"),
+        (["eval", "reference.yaml", "space.svox"], "space.svox: is no floor map"),
         (["eval", "space.svox", "space.svox", "--no-align"], "--no-align: only for floor maps"),
         (["eval", "space.svox", "space.svox", "--exclude", "0,0,1,1"], "--exclude: only for floor maps"),
         (["eval", "half.yaml", "reference.yaml", "--exclude", "0,0,1"], "'0,0,1' is not a region"),

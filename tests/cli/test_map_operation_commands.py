@@ -57,7 +57,7 @@ def test_crop(maps, tmp_path, told, refused):
         "1,2,3": "X0,Y0,Z0",
         "0,0,0,1,x,1": "X0,Y0,Z0",
         "1,0,0,0,1,1": "above",
-        "7,7,7,8,8,8": "reaches",
+        "7,7,7,8,8,8": "the map extends",
     }.items():
         assert words in refused("crop", maps / "a.svox", tmp_path / "no.svox", f"--box={box}")
     assert not (tmp_path / "no.svox").exists()

@@ -18,7 +18,13 @@ from stereovox.geometry.se3 import rotation_matrix
 from stereovox.products.merge import merge as added
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/sevenscenes_redkitchen"
-SETTINGS = {"voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1, "trust.max_speed_mps": 1e6}
+SETTINGS = {
+    "voxel_size": 0.1,
+    "map.keep_frames": True,
+    "trust.max_disagreement": 1,
+    "trust.frozen": False,
+    "trust.max_speed_mps": 1e6,
+}
 
 
 def frames(each=20):
@@ -150,7 +156,12 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
     kept = joined.map.kept_frames.frames
     np.testing.assert_allclose(kept[0].T_world_sensor, a.kept_frames.frames[0].T_world_sensor, atol=0.05)
     assert len(kept) == len(a.kept_frames) + len(b.kept_frames)
-    trusting = {"trust.max_disagreement": 1, "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9}
+    trusting = {
+        "trust.max_disagreement": 1,
+        "trust.frozen": False,
+        "trust.max_speed_mps": 1e6,
+        "trust.max_turn_dps": 1e9,
+    }
     run = sv.Mapper(a.config, **trusting)
     for n, one in enumerate(kept):  # their stamps are those of two walks at once
         assert run.add(replace(one.frame(), stamp_ns=n * 10**9)).refused is None

@@ -27,8 +27,14 @@ MAPS = {
 }
 
 
+MOVING = {"trust.frozen": False}
+
+
 def frames_of(sensor, number):
-    """A camera that turns and walks before walls and things at random depths; every seventh frame has a fault."""
+    """A camera that turns and walks before walls and things at random depths; every seventh frame has a fault.
+
+    The wall moves with it, as in a frozen image: maps that shall take all frames need `trust.frozen` off.
+    """
     chance = np.random.default_rng(sensor)
     for k in range(number):
         depth = np.full((60, 80), 3.0, np.float32) + chance.normal(0, 0.01, (60, 80)).astype(np.float32)
@@ -181,7 +187,9 @@ def in_space(settings, number):
 
     frames = [list(frames_of(sensor, number)) for sensor in range(SENSORS)]
     points = np.random.default_rng(0).uniform(-3, 3, (200, 3))
-    return check(lambda: sv.Mapper(voxel_size=0.1, threads=2, **settings), frames, points, sv.load_map, ask, products)
+    return check(
+        lambda: sv.Mapper(voxel_size=0.1, threads=2, **settings, **MOVING), frames, points, sv.load_map, ask, products
+    )
 
 
 def on_a_floor(number):
@@ -199,7 +207,7 @@ def many_mappers(number):
     frames = [list(frames_of(sensor, number)) for sensor in range(SENSORS)]
 
     def run(some):
-        mapper = sv.Mapper(voxel_size=0.05, threads=2)
+        mapper = sv.Mapper(voxel_size=0.05, threads=2, **MOVING)
         for frame in some:
             mapper.add(frame)
         return cells_of(mapper.map)

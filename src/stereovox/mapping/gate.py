@@ -168,9 +168,9 @@ class Gate:
         glances, ranges = self._history.glances.get(passed.sensor, ()), self._views.ranges(image)
         before = self._history.trusted.get(passed.sensor)
         if before is None or jumped(glances, before, passed.seen):
-            return with_glance((), passed.seen, ranges)
+            glances = with_glance((), passed.seen, ranges)
         in_sensor, in_world = self._views.unmoved(glances, image.camera, image.T_world_sensor, ranges)
-        if is_frozen(in_sensor, in_world):
+        if is_frozen(in_sensor, in_world) and _is_measured(frame):
             detail = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
             raise FrameRefused(
                 "frozen_image",

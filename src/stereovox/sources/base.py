@@ -325,6 +325,11 @@ class Excerpt(Changed):
         if max(start, picked.stop or 0, step) > sys.maxsize:
             raise SourceError(f"frames '{frames}' of a live camera: numbers too large; give smaller ones")
 
+    @property
+    def length(self) -> None:
+        """A live camera may end before all these frames have come, so that their number is unknown."""
+        return None
+
     def __iter__(self) -> Iterator[AnyFrame]:
         with closing(self._stream) as frames:
             yield from islice(frames, *self._bounds)

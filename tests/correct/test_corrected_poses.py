@@ -13,8 +13,8 @@ from stereovox.errors import FrameRefused
 from stereovox.geometry.se3 import interpolate, inverse, rotation_matrix
 
 SETTINGS = {
-    "voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1, "trust.frozen": False, "trust.max_speed_mps": 1e6,
-    "trust.max_turn_dps": 1e9,
+    "voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1, "trust.frozen": False,
+    "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9,
 }  # fmt: skip
 MS = 1_000_000
 

@@ -20,8 +20,8 @@ from stereovox.ros.poses.poses import PoseBuffer
 
 PATH = "/mapPath"
 SETTINGS = {
-    "voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1, "trust.frozen": False, "trust.max_speed_mps": 1e6,
-    "trust.max_turn_dps": 1e9,
+    "voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1, "trust.frozen": False,
+    "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9,
 }  # fmt: skip
 FRAMES = 10
 FIXED_NS = 0

@@ -49,6 +49,9 @@ def tally(cells, ours, truth, threshold, tolerance):
         "tolerance_precision": mean(forgiven),
         "tolerance_recall": mean(found),
         "correlation": pearson([probability(ours.get(cell, 0.0)) for cell in cells], [truth[cell] for cell in cells]),
+        "correlation_free": pearson(
+            [probability(ours[cell]) if cell in ours else 0.0 for cell in cells], [truth[cell] for cell in cells]
+        ),
         "iou": share(tp, tp + fp + fn),
         "average_precision": average_precision([(probability(ours.get(cell, 0.0)), truth[cell]) for cell in cells]),
         "auc": auc([(probability(ours.get(cell, 0.0)), truth[cell]) for cell in cells]),

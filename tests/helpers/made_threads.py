@@ -27,13 +27,13 @@ MAPS = {
 }
 
 
-MOVING = {"trust.frozen": False}
+MOVING = {"trust.frozen": False, "trust.max_disagreement": 1}
 
 
 def frames_of(sensor, number):
     """A camera that turns and walks before walls and things at random depths; every seventh frame has a fault.
 
-    The wall moves with it, as in a frozen image: maps that shall take all frames need `trust.frozen` off.
+    The wall moves with it, as in a frozen image, so maps that take all frames need MOVING.
     """
     chance = np.random.default_rng(sensor)
     for k in range(number):
@@ -199,7 +199,7 @@ def on_a_floor(number):
 
     frames = [list(scans_of(sensor, number)) for sensor in range(SENSORS)]
     points = np.random.default_rng(0).uniform(-3, 3, (200, 2))
-    return check(lambda: GridMapper(voxel_size=0.05), frames, points, load_grid, ask)
+    return check(lambda: GridMapper(voxel_size=0.05, **MOVING), frames, points, load_grid, ask)
 
 
 def many_mappers(number):

@@ -30,7 +30,7 @@ MOST = {
     "floors": 15,
     "modules of the laboratory": 80,
     "lines of the laboratory": 11_500,
-    "words of README and docs": 38_050,
+    "words of README and docs": 37_850,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

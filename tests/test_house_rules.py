@@ -30,7 +30,7 @@ MOST = {
     "floors": 15,
     "modules of the laboratory": 86,
     "lines of the laboratory": 12_850,
-    "words of README and docs": 38_300,
+    "words of README and docs": 38_100,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

@@ -46,7 +46,7 @@ def test_both_floors_give_a_page_maps_and_all_numbers(tmp_path):
     result = reproduce("ist2019", tmp_path, quick=True, progress=lambda *step: done.append(step[:2]))
     assert done[-1][0] == done[-1][1] == max(counted for counted, _ in done)
     numbers = json.loads((tmp_path / "numbers.json").read_text())["experiments"]
-    assert list(numbers) == ["simulation", "corridors", "testbed", "table1"]
+    assert list(numbers) == ["simulation", "corridors", "testbed", "table1", "formulas"]
     for name in ("corridors", "testbed"):
         told = numbers[name]["numbers"]
         assert (told["scans"], told["frames"]) == (45, 45)

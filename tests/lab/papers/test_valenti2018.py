@@ -111,7 +111,10 @@ def test_every_tracking_sequence_below_a_folder_is_found_and_its_labels_are_used
     assert len(judged) == 4
     own = [claim for claim in found[0].claims if claim.text.startswith("kitti_tracking_0003, valenti2018: recall")]
     assert [claim.thesis for claim in own] == ["0.590 (of 0003)"]
-    assert rows[10:] == [f"{drive.name}, {name}" for drive in drives for name in (THESIS, DEFAULT, OCTOMAP)]
+    assert rows[10:] == [
+        f"{drive.name}, {name}, {cells}"
+        for drive in drives for name in (THESIS, DEFAULT, OCTOMAP) for cells in ("whole box", "in view")
+    ]  # fmt: skip
 
 
 def test_without_octomap_there_is_a_row_that_says_so(tmp_path, monkeypatch, no_charts):

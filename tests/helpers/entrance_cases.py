@@ -126,6 +126,25 @@ def _after(change: Callable[[Any], Any], n: int = 100, frames: int = 1) -> Calla
     return lambda kind: [Case(change(good(kind, n + frames)), [good(kind, n + k) for k in range(frames)])]
 
 
+def _seen_from_elsewhere(kind: str) -> list[Case]:
+    """A view of things at several depths, and again with other noise although the sensor has moved."""
+
+    def view(seed: int) -> Any:
+        if kind == IMAGE:
+            blocks = np.random.default_rng(0).uniform(1, 2, (6, 8)).repeat(8, 0).repeat(8, 1)
+            noise = np.random.default_rng(seed).normal(0, 0.003, (48, 64))
+            return good(kind, 0, depth=(blocks + noise).astype(np.float32))
+        if kind == PAIR:
+            bands = [_pair(seed, disparity) for disparity in (3, 8, 4)]
+            left, right = (np.concatenate([getattr(one, eye)[16 * n : 16 * n + 16] for n, one in enumerate(bands)])
+                           for eye in ("left", "right"))  # fmt: skip
+            return good(kind, 0, left=left, right=right)
+        return good(kind, 0, points=good(kind, seed).points)
+
+    T = _moved(good(kind).T_world_sensor, 0.25)
+    return [Case(replace(view(2), stamp_ns=10**8, T_world_sensor=T), [view(0)])]
+
+
 def _moved(T: np.ndarray, metres: float) -> np.ndarray:
     T = T.copy()
     T[0, 3] += metres
@@ -337,6 +356,7 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("frozen_image", 0): lambda kind: [
         Case(good(kind, 0, stamp_ns=10**8, T_world_sensor=_moved(good(kind).T_world_sensor, 0.1)), [good(kind, 0)])
     ],
+    ("frozen_image", 1): _seen_from_elsewhere,
     ("bad_units", 0): _unit,
     ("no_valid_depth", 0): _nothing_left,
     ("no_valid_point", 0): _nothing_left,

@@ -126,7 +126,7 @@ CHECKS = (
     Check("frozen_image", "it is identical to the previous one, but the sensor has moved by over 1 cm or 0.5 degrees",
           _cells(Gate._look), "trust.frozen"),
     Check("frozen_image", "it repeats what the sensor saw from elsewhere, with new noise",
-          _cells(Gate._glances, Gate._glances, "a scan may look the same from many places"), "trust.frozen"),
+          _cells(*[Gate._glances] * 3, *["a scan may look the same from many places"] * 3), "trust.frozen"),
     Check("bad_units", "half of its depths or ranges are far above or far below the map's limits",
           _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays)),
     Check("no_valid_depth", "not one pixel has a value, and none is too far",

@@ -473,7 +473,7 @@ def test_frames_gone_from_the_disk_are_told_of(tmp_path):
     for file in (tmp_path / "m").glob("frames-*"):
         file.unlink()
     mapper = sv.Mapper(saved.config, resume=saved)
-    assert "load it again" in refused(mapper, shaken(frames, 0, 1.0)[1], MapFileError)
+    assert "reload it" in refused(mapper, shaken(frames, 0, 1.0)[1], MapFileError)
 
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="the 7-Scenes kitchen is not here")

@@ -158,5 +158,5 @@ def test_a_frozen_camera_is_refused_with_its_cure_and_good_frames_follow():
     report = mapper.add(freeze(frames[34], metres(frames[30]), np.random.default_rng(1)))
     assert report.refused == "frozen_image"
     assert report.detail.startswith(f"{frames[34].name}: it repeats a view from elsewhere (")
-    assert report.detail.endswith("restart the sensor")
+    assert report.detail.endswith("or correct its pose")
     assert mapper.add(frames[34]).refused is None

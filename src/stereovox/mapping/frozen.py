@@ -35,6 +35,8 @@ NEAR, NEAR_TURN = 0.3, 0.4
 """Glances are compared up to this motion: from farther away, many points are unmoved by chance."""
 HASTE = 4
 """Times the speed before that a step must have to be a jump of the pose."""
+REPEATED = 0.75
+"""Least share of a glance's points that are unmoved in the sensor: wrong depths move them, a frozen image does not."""
 FEW, TIMES = 20, 1.5
 """A frame is frozen if this many points are unmoved in the sensor alone, and this many times more than in the world."""
 
@@ -73,8 +75,9 @@ class FrozenViews:
             marks = marks_of(glance)
             moved = self._placed(ranges, camera, (marks.world - T[:3, 3]) @ T[:3, :3])
             fixed = self._placed(ranges, camera, marks.sensor)
-            in_sensor += int(np.count_nonzero((moved != UNSEEN) & (moved != SAME) & (fixed == SAME)))
-            in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
+            if np.count_nonzero(fixed == SAME) >= REPEATED * np.count_nonzero(fixed != UNSEEN):
+                in_sensor += int(np.count_nonzero((moved != UNSEEN) & (moved != SAME) & (fixed == SAME)))
+                in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
         return in_sensor, in_world
 
     def _placed(

@@ -171,11 +171,9 @@ class Gate:
             glances = with_glance((), passed.seen, ranges)
         in_sensor, in_world = self._views.unmoved(glances, image.camera, image.T_world_sensor, ranges)
         if is_frozen(in_sensor, in_world) and _is_measured(frame):
-            detail = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
-            raise FrameRefused(
-                "frozen_image",
-                f"{name_of(frame)}: it repeats a view from elsewhere ({detail}); restart the sensor",
-            )
+            counts = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"
+            detail = f"it repeats a view from elsewhere ({counts}); restart the sensor, or correct its pose"
+            raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}")
         return with_glance(glances, passed.seen, ranges)
 
     def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:

@@ -83,7 +83,8 @@ def test_a_knocked_camera_is_not_believed_until_it_agrees_again():
     mapper = sv.Mapper(voxel_size=0.1)
     told = [mapper.add(frame).refused for frame in knocked(frames, 20, 80)]
     assert told[:20] == [None] * 20
-    assert set(told[20:50]) == {"disagrees_with_map"}
+    assert "disagrees_with_map" in told[20:50]
+    assert set(told[20:50]) <= {"disagrees_with_map", "frozen_image"}  # to a frozen image its pose is wrong, too
     assert set(told[52:80]) == {"camera_moved"}
     assert told[84:] == [None] * 6
     assert mapper.map.history.settled == {}

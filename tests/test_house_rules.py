@@ -24,7 +24,7 @@ COMMANDS = {
 
 MOST = {
     "modules": 607,
-    "lines": 91_550,
+    "lines": 91_600,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

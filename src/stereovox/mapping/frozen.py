@@ -35,6 +35,8 @@ NEAR, NEAR_TURN = 0.3, 0.4
 """Glances are compared up to this motion: from farther away, many points are unmoved by chance."""
 HASTE = 4
 """Times the speed before that a step must have to be a jump of the pose."""
+POSE_ERROR_M = 0.1
+"""Error of poses that is no motion."""
 REPEATED = 0.75
 """Least share of a glance's points that are unmoved in the sensor: wrong depths move them, a frozen image does not."""
 FEW, TIMES = 20, 1.5
@@ -45,7 +47,7 @@ class FrozenViews:
     """Compares frames with recent glances of the same sensor."""
 
     def __init__(self, config: Config):
-        self._reach, self._least = FARTHEST * config.max_range, config.voxel_size
+        self._reach, self._least = FARTHEST * config.max_range, max(config.voxel_size, POSE_ERROR_M)
         self._noise = PerCamera(partial(RangeNoise.of, config.noise))
 
     def ranges(self, image: AnyImage) -> NDArray[np.float32]:

@@ -190,6 +190,29 @@ def test_no_more_than_was_asked_for(flight):
     assert fast.sender.sent == pytest.approx(20, abs=1)
 
 
+def test_poses_that_come_faster_go_out_at_the_rate_asked_for():
+    sender = PoseSender(link := Link(), message="vision_position_estimate", rate_hz=30)
+    for k in range(400):
+        link.ns = 10**12 + 5_000_000 * k
+        sender.pose(link.ns, np.eye(4))
+    assert sender.sent == pytest.approx(60, abs=1)
+
+
+def test_half_a_second_without_poses_is_a_reset(flight):
+    flight.on(10)
+    flight.stamp_ns += 600_000_000
+    flight.on(10)
+    assert flight.last.reset_counter == 1
+
+
+def test_impossible_numbers_are_not_sent(flight):
+    flight.on(2)
+    assert flight.on(covariance=np.full((6, 6), 1e200)) == [True]
+    away = np.eye(4)
+    away[0, 3] = 1e300
+    assert not flight.sender.pose(flight.stamp_ns + STEP_NS, away)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

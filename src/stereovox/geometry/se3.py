@@ -98,6 +98,22 @@ def rotation_between(one: ArrayLike, other: ArrayLike) -> NDArray[np.float64]:
     return rotation_matrix(axis * (np.arctan2(sine, cosine) / sine))
 
 
+def covariance_at(covariance: NDArray[np.float64], lever: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of another point of a rigid body.
+
+    To first order, a small rotation w about the first point shifts the other one by w x lever more.
+
+    Args:
+        covariance: (6, 6) of a small rotation (radians), then of the first point's shift (metres), along the world's
+            axes.
+        lever: (3,) metres along the world's axes, from the first point to the other.
+    """
+    x, y, z = lever
+    change = np.eye(6)
+    change[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    return change @ covariance @ change.T
+
+
 def _across(a: NDArray[np.float64]) -> NDArray[np.float64]:
     axis = np.asarray(np.cross(a, np.eye(3)[np.argmin(np.abs(a))]), float)
     return axis / np.linalg.norm(axis)

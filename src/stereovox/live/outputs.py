@@ -207,7 +207,7 @@ class LiveSphere:
         if self._mapper is not None and not self._finished and (why := context_of(self._mapper).stale):
             raise StereovoxError(f"the distances are old, the map is {why}; ask again later")
         now = None if self._poses is None or self._finished else self._poses.newest
-        return together(self._last, now if now is not None and np.isfinite(now[1]).all() else None)
+        return together(self._last, now[:2] if now is not None and np.isfinite(now.T_world_body).all() else None)
 
     def finish(self) -> None:
         """Draw the picture; `failure` says why it could not be written."""

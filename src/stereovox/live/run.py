@@ -11,8 +11,6 @@ from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any
 
 from stereovox.errors import StereovoxError
-from stereovox.frame import UpdateReport
-from stereovox.geometry.se3 import inverse, orthonormalise
 from stereovox.live.latency import Latency
 from stereovox.live.outputs import GridFile, LiveSphere, Output
 from stereovox.live.poses import open_poses
@@ -28,14 +26,16 @@ from stereovox.runs.recording import MapRun
 from stereovox.runs.warm_up import warm_up
 from stereovox.sources.base import Stream
 from stereovox.sources.poses.live_poses import LivePoses
-from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
+from stereovox.sources.poses.pose_stream import PoseStream
 
 if TYPE_CHECKING:
-    from stereovox.mavlink.sending import ObstacleSender
+    from stereovox.live.autopilot import Autopilot, SendPose
+    from stereovox.mavlink.link import MavlinkLink
+    from stereovox.mavlink.sectors import SectorRules
 
 Cameras = str | Path | Stream | LiveCamera | Sequence[str | Path | Stream | LiveCamera]
 PosesFrom = str | PoseStream | LivePoses | None
-OUTPUTS = ("grid", "heights", "sphere", "record", "view", "mavlink")
+OUTPUTS = ("grid", "heights", "sphere", "record", "view", "mavlink", "send_pose", "pose_rate_hz", "rules")
 """What `LiveRun.add_outputs` takes."""
 
 
@@ -119,7 +119,7 @@ class LiveRun(Run[MapRun, LiveResult]):
         self.outputs: list[Output] = []
         self._newest_ns: int | None = None
         self._recorder: Recorder | None = None
-        self._sender: ObstacleSender | None = None
+        self._autopilot: Autopilot | None = None
         self.sphere: LiveSphere | None = None
         self._page: list[Output] = []
         self.page = ""
@@ -149,7 +149,10 @@ class LiveRun(Run[MapRun, LiveResult]):
         sphere: str | Path | bool | None = None,
         record: str | Path | None = None,
         view: int | None = None,
-        mavlink: str | None = None,
+        mavlink: str | MavlinkLink | None = None,
+        send_pose: SendPose | None = None,
+        pose_rate_hz: float = 30.0,
+        rules: SectorRules | None = None,
     ) -> None:
         """Add outputs.
 
@@ -160,15 +163,26 @@ class LiveRun(Run[MapRun, LiveResult]):
             record: Recording to write beside (`.mcap`, `.bag` or `.db3`).
             view: Port of a page that shows the map while it grows; 0: any free port. None: no page.
             mavlink: Address of an autopilot that gets obstacle distances (`ObstacleSender`), such as
-                `udpout:127.0.0.1:14540`; where poses come from it too, the same address.
+                `udpout:127.0.0.1:14540`, or a `MavlinkLink`; if poses come from it too, the same address.
+            send_pose: It also gets the body's pose (`PoseSender`): `odometry`, or `vision` for
+                VISION_POSITION_ESTIMATE. None: it does not.
+            pose_rate_hz: Most poses a second.
+            rules: How obstacle distances are made; by default `SectorRules()`.
 
         Raises:
             StereovoxError: One of them cannot be written, the page cannot be served, the map is not level, or the
                 autopilot's address cannot be used.
         """
         if mavlink is not None:
-            self._sender = self._obstacle_sender(mavlink)
-            self._add(_ToldOfFrames(self._sender, self.stream))
+            from stereovox.live.autopilot import Autopilot
+
+            self._autopilot = Autopilot(
+                self.mapper, self.stream, mavlink, self._opened, send_pose=send_pose, pose_rate_hz=pose_rate_hz,
+                rules=rules, notify=self._notify,
+            )  # fmt: skip
+            self._add(self._autopilot)
+        elif send_pose is not None or rules is not None:
+            raise StereovoxError("send_pose, rules: there is no autopilot; give mavlink, its address")
         if sphere:
             picture = None if sphere is True else sphere
             self.sphere = LiveSphere(self.mapper.config, self.stream.mounts, picture, self.mapper, self.stream.poses)
@@ -219,8 +233,8 @@ class LiveRun(Run[MapRun, LiveResult]):
             "dropped": self.stream.dropped,
             **self.stream.counts(),
         }
-        if self._sender is not None:
-            live["obstacle_distances"] = self._sender.sent
+        if self._autopilot is not None:
+            live.update(self._autopilot.counts())
         if self._recorder is not None:
             failed = {"failure": self._recorder.failure} if self._recorder.failure else {}
             live["recorded"] = {**self._recorder.counts, **failed}
@@ -228,30 +242,17 @@ class LiveRun(Run[MapRun, LiveResult]):
         reports = self._run.reports
         return LiveResult(self.mapper.map, self.out, reports, self.stopped, live, self._poses_word(), failures)
 
-    def _obstacle_sender(self, url: str) -> ObstacleSender:
-        """Return what tells an autopilot of obstacles, over the connection that brings its poses if it is the same."""
-        from stereovox.mavlink.sending import ObstacleSender
-        from stereovox.mavlink.stream import MavlinkPoses
-
-        poses = self._opened
-        if isinstance(poses, MavlinkPoses) and poses.url == url:
-            self._open.callback(poses.stop)
-            url_or_link = poses.link
-        else:
-            url_or_link = url
-        return ObstacleSender(self.mapper, url_or_link, tell=self._notify)
-
     def _pose_came(self) -> None:
         """Say what time it is by the newest pose, and where the body is."""
         assert self.stream.poses is not None
         newest = self.stream.poses.newest
-        if newest is None or newest[0] == self._newest_ns:
+        if newest is None or newest.stamp_ns == self._newest_ns:
             return
-        self._newest_ns = newest[0]
-        if self._sender is None:
-            self.mapper.heard(newest[0])
+        self._newest_ns = newest.stamp_ns
+        if self._autopilot is None:
+            self.mapper.heard(newest.stamp_ns)
         else:
-            self._sender.pose(newest[0], newest[1] @ inverse(T_OPTICAL_BODY))
+            self._autopilot.came(newest)
 
     def _add(self, output: Output) -> None:
         self.outputs.append(output)
@@ -288,20 +289,6 @@ def map_live(cameras: Cameras, out: str | Path, *, observers: Sequence[Observer]
     with LiveRun(cameras, out, **options) as run:
         run.add_outputs(**outputs)
         return run.finish(observers)
-
-
-class _ToldOfFrames:
-    """An output that tells an autopilot's sender what the map took in, and where the body was."""
-
-    def __init__(self, sender: ObstacleSender, stream: LiveStream):
-        self._sender, self._stream = sender, stream
-        self.finish, self.close = sender.finish, sender.close
-
-    def after(self, frame: Any, report: UpdateReport) -> None:
-        if report.refused:
-            return
-        T_world_body = frame.T_world_sensor @ inverse(T_OPTICAL_BODY @ self._stream.mount(frame))
-        self._sender.at(orthonormalise(T_world_body), frame.sensor, stamp_ns=frame.stamp_ns)
 
 
 def _cameras(cameras: Cameras, poses: PosesFrom) -> tuple[Sequence[LiveCamera], PosesFrom]:

@@ -22,7 +22,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
 from stereovox.frame.wall_clock import epoch_ns
-from stereovox.geometry.se3 import Transform, inverse
+from stereovox.geometry.se3 import Transform, covariance_at, inverse
 from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera, open_images
 from stereovox.runs.pose_choice import GIVEN, HOW, TRACK, has_poses
@@ -125,6 +125,7 @@ class LiveStream(Stream):
         config: Settings, for tracking.
         check: Called again and again, also while no image comes; an exception of it ends the iteration.
         on_start: Called once cameras and poses have been started.
+        on_given: Called with each image of the first camera in its thread, if images bring their poses; None: nothing.
         moment: When the image that was yielded last was taken and arrived.
         mounts: T_body_camera (4, 4) by the name of the camera, which is the `sensor` of its images.
         tracked: Whether the first camera is tracked.
@@ -146,6 +147,7 @@ class LiveStream(Stream):
         self.config = load_config("default")
         self.check: Callable[[], object] = lambda: None
         self.on_start: Callable[[], object] = lambda: None
+        self.on_given: Callable[[AnyFrame], object] | None = None
         self._notify, self._seconds = notify, seconds
         self._feeds = [_feed(camera) for camera in check_cameras(cameras)]
         if poses is None:
@@ -341,6 +343,8 @@ class LiveStream(Stream):
                 )
                 while len(feed.moments) > REMEMBERED:
                     feed.moments.popitem(last=False)
+                if self.poses is None and self.on_given is not None and feed is self._feeds[0]:
+                    self.on_given(replace(image, sensor=feed.name))
                 yield image
                 if self._stopped.is_set():
                     return
@@ -353,9 +357,14 @@ class LiveStream(Stream):
         feed.latest = Latest(_announced(self._noted(feed), tracker.expect), UNTRACKED)
         T_camera_body = inverse(feed.camera.T_body_camera)
         for image, tracked in follow(feed.latest, tracker):
-            T = np.full((4, 4), np.nan) if tracked.lost else tracked.T_world_sensor @ T_camera_body
+            if tracked.lost:
+                T, covariance = np.full((4, 4), np.nan), None
+            else:
+                T = tracked.T_world_sensor @ T_camera_body
+                covariance = covariance_at(tracked.covariance, T[:3, 3] - tracked.T_world_sensor[:3, 3])
             if not tracked.lost or poses.added:
-                poses.add(image.stamp_ns - feed.offset_ns, T)
+                quality = round(100 * tracked.inlier_share)
+                poses.add(image.stamp_ns - feed.offset_ns, T, covariance=covariance, quality=quality)
             self.imu_use = tracker.imu_use
             yield image
 

@@ -23,12 +23,14 @@ FRD = np.diag([1.0, -1.0, -1.0])
 """Forward, left, up to forward, right, down, and back."""
 LOCAL_FRD, BODY_FRD, BY_VISION = 20, 12, 2
 """MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD, MAV_ESTIMATOR_TYPE_VISION."""
-HIGHEST_RATE_HZ, EARLY = 200.0, 0.75
-"""Most messages a second, and the share of a period after which the next may be sent: cameras are not punctual."""
+HIGHEST_RATE_HZ, EARLY = 200.0, 0.25
+"""Most messages a second, and the share of a period by which one may be sent early: cameras are not punctual."""
 LONGEST_GAP_NS = 500_000_000
 """Between two poses, for a velocity."""
 STANDS_M, STANDS_RAD = 0.05, 0.04
 """By which poses may differ at any time without being a jump."""
+FARTHEST_M, WIDEST = 1e6, 1e30
+"""Least position, and least entry of a covariance, that is never a measured one."""
 STEEPEST = 0.01
 """Least cosine of the pitch at which roll and yaw, and so their covariance, mean anything."""
 
@@ -42,9 +44,9 @@ class PoseSender:
 
     Each pose is sent once, when it comes, and nothing without one. A pose is not sent if it is not finite, is no rigid
     motion, is not later than the one before, or shows what was more than `max_age_s` ago by its stamp. `reset_counter`
-    goes up by one with the first pose after a loss, a jump, or `reset`, so that the estimator does not take the step
-    for motion. `time_usec` is when the vehicle was there, by this machine's clock, which the autopilot may ask for
-    (TIMESYNC). Threads may share it.
+    goes up by one with the first pose after a loss, a jump, half a second without poses, or `reset`, so that the
+    estimator does not take the step for motion. `time_usec` is when the vehicle was there, by this machine's clock,
+    which the autopilot may ask for (TIMESYNC). Threads may share it.
 
     Args:
         connection: A `MavlinkLink`, or the address of one, which is then closed with the sender.
@@ -78,13 +80,13 @@ class PoseSender:
         if not 0 < max_age_s <= 1:
             raise StereovoxError(f"max_age_s {max_age_s:g}: give seconds above 0, at most 1")
         self._message, self._tell = message, tell
-        self._period_ns, self._max_age_ns = EARLY * 1e9 / rate_hz, max_age_s * 1e9
+        self._period_ns, self._max_age_ns = round(1e9 / rate_hz), max_age_s * 1e9
         self._own = isinstance(connection, str)
         self.link = MavlinkLink(connection, tell=tell) if isinstance(connection, str) else connection
         self._clock = StampClock(self.link.now_ns, "live", epoch_ns, ordered=False)
         self.sent = self.reset_counter = 0
         self._last: tuple[int, Transform] | None = None
-        self._sent_ns, self._why, self._stepped = -(1 << 62), "", False
+        self._due_ns, self._why, self._stepped = -(1 << 62), "", False
         self._lock = threading.Lock()
 
     def pose(
@@ -115,12 +117,11 @@ class PoseSender:
                 return False
             T[:3, :3] = orthonormalise(T)[:3, :3]
             velocity = self._moved(stamp_ns, T)
-            early = now_ns - self._sent_ns < self._period_ns
-            if early or (self._message == "odometry" and velocity is None):
+            if self._is_early(now_ns) or (self._message == "odometry" and velocity is None):
                 return False
             if self._stepped:
                 self.reset_counter, self._stepped = (self.reset_counter + 1) % 256, False
-            self._sent_ns = now_ns
+            self._due_ns = max(self._due_ns, now_ns - round(EARLY * self._period_ns)) + self._period_ns
             usec = (now_ns - age_ns) // 1000
             done = self.link.send(self._made(usec, T, velocity, covariance, quality))
             self.sent += done
@@ -154,7 +155,7 @@ class PoseSender:
 
     def _unusable(self, stamp_ns: int, T: Transform, age_ns: int, quality: int) -> str:
         """Return why a pose cannot be sent, "" if it can."""
-        if not np.isfinite(T).all() or rigidity_error(T) > RIGID:
+        if not (np.abs(T) < FARTHEST_M).all() or rigidity_error(T) > RIGID:
             return "the pose is not known"
         if quality < 0:
             return "its tracker has failed"
@@ -163,6 +164,11 @@ class PoseSender:
         if self._last is not None and stamp_ns <= self._last[0]:
             return "its stamp is not later than the one before"
         return ""
+
+    def _is_early(self, now_ns: int) -> bool:
+        """Return whether too little time has passed for the next message."""
+        left_ns = self._due_ns - now_ns
+        return EARLY * self._period_ns < left_ns <= self._period_ns  # more: the clock was set back
 
     def _lose(self, why: str) -> None:
         if not self._why:
@@ -180,6 +186,7 @@ class PoseSender:
             self._stepped = True
             return None
         if stamp_ns - last[0] > LONGEST_GAP_NS:
+            self._stepped = True  # what sends the poses may have started anew meanwhile
             return None
         R = T[:3, :3]
         return np.concatenate([R.T @ (T[:3, 3] - last[1][:3, 3]), rotation_vector(last[1][:3, :3].T @ R)]) / seconds
@@ -217,7 +224,7 @@ def upper_triangle(covariance: ArrayLike | None, angles: tuple[float, float, flo
     """
     found = np.full((6, 6), np.nan) if covariance is None else np.asarray(covariance, float)
     _, pitch, yaw = angles
-    if found.shape != (6, 6) or not np.isfinite(found).all() or abs(cos(pitch)) < STEEPEST:
+    if found.shape != (6, 6) or not (np.abs(found) < WIDEST).all() or abs(cos(pitch)) < STEEPEST:
         return [float("nan")] * 21
     by_rates = np.array(  # a rotation about the world's axes, by small changes of roll, pitch and yaw
         [

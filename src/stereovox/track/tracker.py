@@ -150,6 +150,7 @@ class Tracked:
         lost: Why the pose is not known, in words; "" if it is.
         begins: Whether a map begins with this image: it is lost until the next one fits it.
         believed: Whether the pose follows from a given motion alone, because nothing known was in view.
+        inlier_share: Share of what is known in the image that lies where the pose puts it; 0: not measured.
     """
 
     T_world_sensor: Transform
@@ -157,6 +158,7 @@ class Tracked:
     lost: str = ""
     begins: bool = False
     believed: bool = False
+    inlier_share: float = 0.0
 
     def moved(self, T_to_world: Transform) -> Tracked:
         """Return it in another world; T_to_world (4, 4) maps the present one into it."""
@@ -211,6 +213,7 @@ class Tracker:
         self._see: Ahead[AnyFrame, Any] | None = None
         self._sensor = ""
         self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
+        self._inlier_share = 0.0
         self._stamps: list[int] = []  # of the last tracked images
         self._learned, self._sure = 0, np.eye(4)  # the last pose that counted
         self._adrift = False  # tracked, though open along some direction
@@ -291,7 +294,7 @@ class Tracker:
         if believed:
             fit = Fit(expected, doubt, fit.known, 1.0)
         contrary = _doubt(fit, Demand(0.0, FOLLOWING.inlier_share))
-        self._place(expected if contrary else fit.T_map_camera, fit.covariance)
+        self._place(expected if contrary else fit.T_map_camera, fit.covariance, 0.0 if believed else fit.inlier_share)
         self._motion, self._trial = motion, 0
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         if self._gyroscope is not None:
@@ -339,7 +342,7 @@ class Tracker:
         if why:
             return self._begin(evidence, seen, stamp_ns, why) if self._learned < 2 else self._lose(why)
         before = self._T
-        self._place(fit.T_map_camera, fit.covariance)
+        self._place(fit.T_map_camera, fit.covariance, fit.inlier_share)
         self._motion = inverse(before) @ self._T
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         why = self._wait(evidence, seen, fit)
@@ -472,8 +475,8 @@ class Tracker:
         T[:3, :3] = T[:3, :3] @ turn.R
         return T, TURNED_AWAY + 4 * float(np.sqrt(np.trace(self._gyroscope.doubt(turn))))
 
-    def _place(self, T: Transform, covariance: NDArray[np.float64]) -> None:
-        self._T, self._covariance = orthonormalise(T), covariance
+    def _place(self, T: Transform, covariance: NDArray[np.float64], inlier_share: float = 0.0) -> None:
+        self._T, self._covariance, self._inlier_share = orthonormalise(T), covariance, inlier_share
 
     def _lose(self, why: str) -> Tracked:
         self._adrift = False
@@ -484,7 +487,8 @@ class Tracker:
         return self._lost(why)
 
     def _found(self, believed: bool = False) -> Tracked:
-        return Tracked(self._T, self._covariance, believed=believed).moved(self._start)
+        found = Tracked(self._T, self._covariance, believed=believed, inlier_share=self._inlier_share)
+        return found.moved(self._start)
 
     def _lost(self, why: str) -> Tracked:
         return Tracked(self._T, np.full((6, 6), np.inf), why).moved(self._start)

@@ -28,12 +28,26 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.live.rig import LiveCamera
     from stereovox.live.run import LiveResult
+    from stereovox.mavlink.sectors import SectorRules
 
 EXAMPLES = """stereovox live realsense: --poses udp://:5005 --out room.svox --view
 stereovox live sim:room --out room.svox --mavlink udpout:127.0.0.1:14550"""
 PORT = 8080
 WAIT_S = 0.3
 """Copy of `live.stream.WAIT_S`, so that `--help` need not import it."""
+
+POSE_RATE_HZ = 30.0
+RULES: dict[str, dict[str, Any]] = {
+    "half_height": {
+        "type": float,
+        "metavar": "M",
+        "help": "--mavlink: height above and below the body that counts (0.3)",
+    },
+    "own_radius": {"type": float, "metavar": "M", "help": "--mavlink: unknown cells so near are the vehicle (0.5)"},
+    "max_distance": {"type": float, "metavar": "M", "help": "--mavlink: how far obstacles are looked for (5)"},
+    "unknown": {"choices": ("obstacle", "unmeasured"), "help": "--mavlink: what unknown space counts as (obstacle)"},
+}
+"""Options that are fields of `SectorRules`."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -73,6 +87,16 @@ def add_arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     about = "tell an autopilot at this address (udpout:127.0.0.1:14540) of obstacles: OBSTACLE_DISTANCE"
     parser.add_argument("--mavlink", metavar="URL", help=about)
+    parser.add_argument(
+        "--send-pose", nargs="?", const="odometry", choices=("odometry", "vision"),
+        help="send the body's pose there, too: ODOMETRY (odometry) or VISION_POSITION_ESTIMATE (vision)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--pose-rate", type=float, default=POSE_RATE_HZ, metavar="HZ", dest="pose_rate_hz",
+        help=f"most poses a second ({POSE_RATE_HZ:g})",
+    )  # fmt: skip
+    for name, options in RULES.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", **options)
     parser.add_argument("--resume", action="store_true", help="continue the map at --out, in the world of its poses")
     add_usual(parser, "profile", "voxel-size", "max-range", "threads")
     add_settings(parser, "deadline_ms=25")
@@ -84,6 +108,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.live.run import OUTPUTS, LiveOptions, LiveRun
 
     check_ending("--sphere", arguments.sphere, ".png")
+    rules = _rules(arguments)
     live = LiveRun(_cameras(arguments), arguments.out, **options_of(LiveOptions, arguments))
     with live, ExitStack() as stack:
         say_about_compiling()
@@ -91,8 +116,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
             from stereovox.cli.look.view import silence_server_log
 
             silence_server_log()
-        outputs = {name: getattr(arguments, name) for name in OUTPUTS}
-        live.add_outputs(**{**outputs, "heights": heights_of(arguments.heights)})
+        outputs = {name: getattr(arguments, name) for name in OUTPUTS if hasattr(arguments, name)}
+        live.add_outputs(**{**outputs, "heights": heights_of(arguments.heights), "rules": rules})
         if live.page:
             say(f"open {live.page} in a browser to see the map grow")
         say("mapping; Ctrl-C ends")
@@ -100,6 +125,19 @@ def run(arguments: Namespace) -> dict[str, Any]:
     result = done.summary()
     _print_result(result, done, arguments)
     return result
+
+
+def _rules(arguments: Namespace) -> SectorRules | None:
+    """Return how obstacle distances are made; raises StereovoxError for options without an autopilot."""
+    given = {name: value for name in RULES if (value := getattr(arguments, name)) is not None}
+    if not arguments.mavlink and (given or arguments.send_pose):
+        option = "--send-pose" if arguments.send_pose else f"--{next(iter(given)).replace('_', '-')}"
+        raise StereovoxError(f"{option}: there is no autopilot; give --mavlink URL, its address")
+    if not given:
+        return None
+    from stereovox.mavlink.sectors import SectorRules
+
+    return SectorRules(**given)
 
 
 def _cameras(arguments: Namespace) -> str | LiveCamera:
@@ -143,6 +181,8 @@ def _print_result(result: dict[str, Any], done: LiveResult, arguments: Namespace
             say(f"{what}: {file}")
     if "obstacle_distances" in live:
         say(f"{live['obstacle_distances']} obstacle distances sent to {arguments.mavlink}")
+    if "poses_sent" in live:
+        say(f"{live['poses_sent']} poses sent to {arguments.mavlink}, {live['pose_resets']} resets")
     if "recorded" in live and not any(why.startswith(f"{arguments.record}:") for why in failures):
         counts = ", ".join(f"{count} {what}" for what, count in live["recorded"].items()) or "nothing"
         say(f"recorded in {arguments.record}: {counts}")

@@ -11,7 +11,7 @@ from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import FrameRefused
 from stereovox.geometry.se3 import Transform, rigidity_error, rotation_vector
@@ -39,6 +39,15 @@ class _Late(NamedTuple):
     stamp_ns: int
     T: Transform
     arrived_ns: int
+
+
+class NewestPose(NamedTuple):
+    """The newest pose of a body, and what its tracker says of it; fields as the arguments of `LivePoses.add`."""
+
+    stamp_ns: int
+    T_world_body: Transform
+    covariance: NDArray[np.float64] | None
+    quality: int
 
 
 class LivePoses:
@@ -78,9 +87,17 @@ class LivePoses:
         self._change, self._ended = Condition(), ""
         self._listeners: list[Callable[[], object]] = []
         self._late: list[_Late] = []
+        self._said: tuple[int, NDArray[np.float64] | None, int] = (0, None, 0)
         self.delays = Delays()
 
-    def add(self, stamp_ns: int, T_world_body: ArrayLike, confident: bool = True) -> None:
+    def add(
+        self,
+        stamp_ns: int,
+        T_world_body: ArrayLike,
+        confident: bool = True,
+        covariance: ArrayLike | None = None,
+        quality: int = 0,
+    ) -> None:
         """Add a pose; the first of several with one stamp counts.
 
         Args:
@@ -88,6 +105,9 @@ class LivePoses:
             T_world_body: (4, 4), maps the body (x forward, y left, z up) into the world (z up). A non-finite or
                 non-rigid one is stored as unusable, and frames that need it are refused: pass NaN if a tracker is lost.
             confident: Whether its tracker trusts it; if not, the pose is unusable, too.
+            covariance: (6, 6) of a small rotation about the body (radians), then of its shift (metres), along the
+                world's axes; None: unknown. An autopilot gets it (`PoseSender`).
+            quality: 1 to 100 per cent, 0 unknown; for an autopilot, too.
         """
         stamp_ns, T = int(stamp_ns), np.array(T_world_body, float)
         if not confident:
@@ -100,6 +120,7 @@ class LivePoses:
         self.delays.heard(stamp_ns, now_ns)
         with self._change:
             self.added += 1
+            self._said = stamp_ns, None if covariance is None else np.array(covariance, float), int(quality)
             self._take(stamp_ns, T, now_ns)
             self._change.notify_all()
         for tell in self._listeners:
@@ -184,10 +205,14 @@ class LivePoses:
             return self._stamps[-1] if self._stamps else None
 
     @property
-    def newest(self) -> tuple[int, Transform] | None:
-        """Stamp and T_world_body (4, 4) of the newest pose, NaN if it is unusable; None without any."""
+    def newest(self) -> NewestPose | None:
+        """The newest pose, NaN if it is unusable; None without any."""
         with self._change:
-            return (self._stamps[-1], self._poses[self._stamps[-1]]) if self._stamps else None
+            if not self._stamps:
+                return None
+            stamp_ns, (of_ns, covariance, quality) = self._stamps[-1], self._said
+            said = (covariance, quality) if of_ns == stamp_ns else (None, 0)
+            return NewestPose(stamp_ns, self._poses[stamp_ns], *said)
 
     def __len__(self) -> int:
         return len(self._stamps)

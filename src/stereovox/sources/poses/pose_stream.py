@@ -138,10 +138,10 @@ class LineStream(PoseStream):
             self.counts["bad"] += 1
             self.trouble = f"{self.name}: a line cannot be read ({_short(text)}: {error}); send '{FORMAT}'"
             return
-        confident = confidence >= CONFIDENT
+        confident = confidence is None or confidence >= CONFIDENT
         if not confident:
             self.counts["low_confidence"] += 1
-        self.poses.add(stamp_ns, body_pose(T, self.axes), confident)
+        self.poses.add(stamp_ns, body_pose(T, self.axes), confident, quality=_quality(confidence))
 
 
 class UdpPoses(LineStream):
@@ -257,11 +257,12 @@ class T265(PoseStream):
         confident = data.tracker_confidence >= CONFIDENT
         if not confident:
             self.counts["low_confidence"] += 1
-        self.poses.add(ns_from_ms(image.get_timestamp()), body_pose(T, "opengl"), confident)
+        quality = _quality(data.tracker_confidence)
+        self.poses.add(ns_from_ms(image.get_timestamp()), body_pose(T, "opengl"), confident, quality=quality)
 
 
-def read_line(text: str) -> tuple[int, Transform, float]:
-    """Return stamp in nanoseconds, pose (4, 4) and confidence (3 if none is reported) of a line.
+def read_line(text: str) -> tuple[int, Transform, float | None]:
+    """Return stamp in nanoseconds, pose (4, 4) and confidence (None if none is reported) of a line.
 
     Raises ValueError for anything but `stamp tx ty tz qx qy qz qw [confidence]`.
     """
@@ -271,8 +272,8 @@ def read_line(text: str) -> tuple[int, Transform, float]:
         raise ValueError(f"needs 7 or 8 finite numbers behind the stamp, not {len(numbers)}")
     if max(map(abs, numbers)) > 1e6 or np.hypot.reduce(numbers[3:7]) < 1e-6:
         raise ValueError("quaternion of length zero, or numbers beyond a million")
-    confidence = numbers[7] if len(numbers) == 8 else float(HIGHEST_CONFIDENCE)
-    if not 0 <= confidence <= HIGHEST_CONFIDENCE:
+    confidence = numbers[7] if len(numbers) == 8 else None
+    if confidence is not None and not 0 <= confidence <= HIGHEST_CONFIDENCE:
         raise ValueError(f"confidence {confidence:g} is not 0 to {HIGHEST_CONFIDENCE}")
     return ns_from_seconds(stamp), from_quaternion(numbers[:3], numbers[3:7]), confidence
 
@@ -310,6 +311,11 @@ def _opened(name: str, address: tuple[str, int], kind: socket.SocketKind) -> soc
     except OSError as error:
         raise SourceError(f"{name}: {error.strerror or error}; choose a free port of this machine") from None
     return opened
+
+
+def _quality(confidence: float | None) -> int:
+    """Return a confidence in per cent, 0 if it is unknown."""
+    return 0 if confidence is None else round(100 * confidence / HIGHEST_CONFIDENCE)
 
 
 def _short(text: bytes) -> str:

@@ -23,8 +23,8 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 602,
-    "lines": 90_900,
+    "modules": 603,
+    "lines": 91_150,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

@@ -168,7 +168,7 @@ class PoseSender:
     def _is_early(self, now_ns: int) -> bool:
         """Return whether too little time has passed for the next message."""
         left_ns = self._due_ns - now_ns
-        return EARLY * self._period_ns < left_ns <= self._period_ns  # more: the clock was set back
+        return EARLY * self._period_ns < left_ns <= 2 * self._period_ns  # more: the clock was set back
 
     def _lose(self, why: str) -> None:
         if not self._why:

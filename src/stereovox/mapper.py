@@ -15,7 +15,7 @@ from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import ConfigError, MapFileError
-from stereovox.frame import AnyFrame, Cloud, Frame, Scan
+from stereovox.frame import AnyFrame, Cloud, Frame, Range, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.validate import validate_upright_scan
@@ -102,7 +102,7 @@ class AnyMapper(Protocol[SeenT]):
 
 
 class Mapper(Aged):
-    """Builds a voxel map from depth images, stereo pairs or clouds of lidars.
+    """Builds a voxel map from depth images, stereo pairs, clouds of lidars or distances of sonars.
 
     A frame that cannot be trusted is refused and changes nothing but the count of refusals.
 
@@ -142,11 +142,11 @@ class Mapper(Aged):
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = Comparison(self.config, self._intake.gate)
 
-    def add(self, frame: AnyFrame) -> UpdateReport:
+    def add(self, frame: AnyFrame | Range) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
         Args:
-            frame: Depth image, stereo pair or cloud, with the pose it was taken at.
+            frame: Depth image, stereo pair, cloud or range, with the pose it was taken at.
 
         Returns:
             What the frame changed and how long each step took, or why it was refused.
@@ -203,7 +203,7 @@ class Mapper(Aged):
         with self._correcting:
             return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
-    def expect(self, frame: AnyFrame) -> None:
+    def expect(self, frame: AnyFrame | Range) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.
 
         Call it before `add` of the frame before; the map is the same without. Nothing happens with one thread

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
 from stereovox.maps.record.history import (
@@ -78,7 +78,7 @@ class Gate:
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> GateResult:
+    def check(self, frame: AnyFrame | Scan | Range, image: AnyImage | Scan) -> GateResult:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -107,7 +107,7 @@ class Gate:
         return any(abs(one.pose[11] - height) > metres for name, one in trusted.items() if name != passed.sensor)
 
     def check_agreement(
-        self, frame: AnyFrame | Scan, passed: GateResult, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan | Range, passed: GateResult, against: float | None, sight: Sight | None
     ) -> GateResult:
         """Return what `accept` needs of a frame that was compared with the map.
 
@@ -127,7 +127,7 @@ class Gate:
         if passed.after:
             self._history.settled[passed.after] += 1
 
-    def _identify(self, frame: AnyFrame | Scan) -> tuple[str, int]:
+    def _identify(self, frame: AnyFrame | Scan | Range) -> tuple[str, int]:
         """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses that are too old."""
         off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
@@ -138,11 +138,12 @@ class Gate:
             detail = f"sensor is not a printable name of at most {MAX_NAME_LENGTH} characters; rename it"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
         usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
+        usual = "range" if isinstance(frame, Range) else usual
         return frame.sensor or usual, int(frame.stamp_ns)
 
-    def _look(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> ImageFingerprint | None:
+    def _look(self, frame: AnyFrame | Scan | Range, sensor: str, now: StampedPose) -> ImageFingerprint | None:
         """Return the frame's checksum. Raises FrameRefused for a repeated image although the sensor has moved."""
-        if not self._trust.frozen:
+        if not self._trust.frozen or isinstance(frame, Range):  # one number may well be the one before
             return None
         look, before = ImageFingerprint(_digest(frame), now.pose), self._history.looks.get(sensor)
         if before is None or before.digest != look.digest:
@@ -154,7 +155,7 @@ class Gate:
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
 
-    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
+    def _fitting(self, frame: AnyFrame | Scan | Range, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one, or that is accepted again."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
@@ -182,7 +183,7 @@ class Gate:
 
     def _settled(
         self,
-        frame: AnyFrame | Scan,
+        frame: AnyFrame | Scan | Range,
         passed: GateResult,
         trusted: StampedPose,
         found: tuple[str, float],

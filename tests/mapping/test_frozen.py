@@ -11,7 +11,7 @@ from stereovox.config import load_config
 from stereovox.depth import DepthPipeline
 from stereovox.frame import CheckedCloud
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.mapping.frozen import FEW, FrozenViews, is_frozen, jumped, with_glance
+from stereovox.mapping.frozen import CHECKED, FEW, STEP, FrozenViews, is_frozen, jumped, moved_on, with_glance
 from stereovox.maps.record.glance import binned
 from stereovox.maps.record.history import MAX_GLANCES, StampedPose
 from stereovox_lab.checks.bad_images import metres
@@ -121,6 +121,22 @@ def test_a_pose_that_jumps_is_not_a_frozen_image(images, step_m, step_deg, ms, f
     assert not jumped((), at(before, 10**8), at(now, 10**9))
 
 
+def test_frames_are_compared_once_the_sensor_has_moved_a_part_of_a_step(images):
+    (glance,) = with_glance((), at(np.eye(4)), VIEWS.ranges(images[0]))
+    part_m = STEP * glance.typical_m / CHECKED
+
+    def pose(parts, deg=0.0):
+        T = np.eye(4)
+        T[0, 3], T[:3, :3] = parts * part_m, rotation_matrix([0, np.radians(deg), 0])
+        return at(T).pose
+
+    assert not moved_on(glance, pose(0.1), pose(0.9))
+    assert moved_on(glance, pose(0.9), pose(1.1))
+    assert moved_on(glance, pose(0.1), pose(0.1, 2.1))
+    assert not moved_on(glance, pose(2.1, 1), pose(2.9, 1.9))
+    assert moved_on(glance, pose(0), pose(3.5))
+
+
 def test_clouds_have_directions_too():
     ends = np.array([[2.0, 0, 0.1], [0, 3.0, 0.1], [0, 0, 4.0], [1e9, 1, 0], [0, -5.0, 0]])
     cloud = CheckedCloud(ends, None, np.array([True] * 4 + [False]), sv.Lidar(), np.eye(4))
@@ -153,10 +169,10 @@ def test_a_frozen_camera_frees_hardly_anything_in_a_young_map():
 def test_a_frozen_camera_is_refused_with_its_cure_and_good_frames_follow():
     frames = list(sv.open_source("sim:room?image_width=160&seed=8", frames=":60"))
     mapper = sv.Mapper(voxel_size=0.1)
-    for frame in frames[:31]:
+    for frame in frames[:32]:
         mapper.add(frame)
-    report = mapper.add(freeze(frames[34], metres(frames[30]), np.random.default_rng(1)))
+    report = mapper.add(freeze(frames[37], metres(frames[31]), np.random.default_rng(1)))
     assert report.refused == "frozen_image"
-    assert report.detail.startswith(f"{frames[34].name}: it repeats a view from elsewhere (")
+    assert report.detail.startswith(f"{frames[37].name}: it repeats a view from elsewhere (")
     assert report.detail.endswith("or correct its pose")
-    assert mapper.add(frames[34]).refused is None
+    assert mapper.add(frames[37]).refused is None

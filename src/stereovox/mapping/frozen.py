@@ -18,9 +18,9 @@ from stereovox.config import Config
 from stereovox.frame import AnyImage, CheckedCloud
 from stereovox.geometry.se3 import Transform, apart
 from stereovox.integrate.views import PerCamera, camera_rays
-from stereovox.maps.record._glance import SAME, SIDE, UNSEEN, bin_image, place
+from stereovox.maps.record._glance import ELSEWHERE, SAME, SIDE, bin_image, place
 from stereovox.maps.record.glance import AT_REST, Glance, binned, marks_of
-from stereovox.maps.record.history import MAX_GLANCES, StampedPose
+from stereovox.maps.record.history import MAX_GLANCES, MAX_SENSORS, StampedPose
 from stereovox.sensors.noise import RangeNoise
 
 SAMPLED = 4000
@@ -31,6 +31,10 @@ BLUR = 1.5
 """Tolerance between two frames, as a multiple of the noise of one: both are noisy."""
 STEP, TURN = 0.1, np.radians(8)
 """A glance is kept once the sensor has moved by this share of the median distance in view, or turned by this angle."""
+CHECKED = 4
+"""How often frames are compared within such a step; those between two comparisons have hardly moved."""
+LEAST_M = 0.01
+"""Least median distance: nothing is nearer."""
 NEAR, NEAR_TURN = 0.3, 0.4
 """Glances are compared up to this motion: from farther away, many points are unmoved by chance."""
 HASTE = 4
@@ -49,6 +53,7 @@ class FrozenViews:
     def __init__(self, config: Config):
         self._reach, self._least = FARTHEST * config.max_range, max(config.voxel_size, POSE_ERROR_M)
         self._noise = PerCamera(partial(RangeNoise.of, config.noise))
+        self._tolerances: dict[Glance, NDArray[np.float32]] = {}
 
     def ranges(self, image: AnyImage) -> NDArray[np.float32]:
         """Return the range in each direction, (SIDE, SIDE) metres, 0 for none."""
@@ -70,27 +75,46 @@ class FrozenViews:
         T: T_world_sensor (4, 4) of the frame. ranges: its ranges, (SIDE, SIDE) metres.
         """
         in_sensor = in_world = 0
+        pose, into = tuple(T[:3].ravel().tolist()), _turned_back(T)
         for glance in glances:
-            metres, angle = apart(glance.pose, tuple(T[:3].ravel().tolist()))
-            if metres >= NEAR * glance.typical_m or angle >= NEAR_TURN:
+            metres, angle = apart(glance.pose, pose)
+            share = metres / max(glance.typical_m, LEAST_M)
+            if share >= NEAR or angle >= NEAR_TURN or (share < STEP / 2 and angle < TURN / 2):
                 continue
-            marks = marks_of(glance)
-            moved = self._placed(ranges, camera, (marks.world - T[:3, 3]) @ T[:3, :3])
-            fixed = self._placed(ranges, camera, marks.sensor)
-            if np.count_nonzero(fixed == SAME) >= REPEATED * np.count_nonzero(fixed != UNSEEN):
-                in_sensor += int(np.count_nonzero((moved != UNSEEN) & (moved != SAME) & (fixed == SAME)))
+            marks, tolerance = marks_of(glance), self._tolerance(glance, camera)
+            fixed, moved = np.empty((2, len(tolerance)), np.uint8)
+            place(ranges, marks.sensor, AT_REST, tolerance, fixed)
+            if np.count_nonzero(fixed == SAME) >= REPEATED * np.count_nonzero(fixed):
+                place(ranges, (marks.world - T[:3, 3]).astype(np.float32), into, tolerance, moved)
+                in_sensor += int(np.count_nonzero((moved == ELSEWHERE) & (fixed == SAME)))
                 in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
         return in_sensor, in_world
 
-    def _placed(
-        self, ranges: NDArray[np.float32], camera: VirtualCamera | Lidar, points: NDArray[np.floating]
-    ) -> NDArray[np.uint8]:
-        """Return where points (N, 3) in the sensor's frame are among its ranges, as `place`."""
-        distances = np.sqrt(np.einsum("ni,ni->n", points, points))
-        tolerance = BLUR * np.maximum(self._least, self._noise[camera].sigma(distances))
-        found = np.empty(len(points), np.uint8)
-        place(ranges, points.astype(np.float32), AT_REST, tolerance.astype(np.float32), found)
-        return found
+    def _tolerance(self, glance: Glance, camera: VirtualCamera | Lidar) -> NDArray[np.float32]:
+        """Return by how many metres the ranges of a glance's points may differ, (N,)."""
+        if glance not in self._tolerances:
+            if len(self._tolerances) >= MAX_GLANCES * MAX_SENSORS:
+                self._tolerances.clear()
+            sigma = self._noise[camera].sigma(np.linalg.norm(marks_of(glance).sensor, axis=1))
+            self._tolerances[glance] = (BLUR * np.maximum(self._least, sigma)).astype(np.float32)
+        return self._tolerances[glance]
+
+
+def _turned_back(T: Transform) -> NDArray[np.float32]:
+    """Return the matrix (3, 4) that turns points from the world's axes into the sensor's."""
+    turned = np.zeros((3, 4), np.float32)
+    turned[:, :3] = T[:3, :3].T
+    return turned
+
+
+def moved_on(glance: Glance, before: tuple[float, ...], now: tuple[float, ...]) -> bool:
+    """Return whether the sensor is another CHECKED part of a step away from a glance than it was before."""
+
+    def parts(pose: tuple[float, ...]) -> tuple[int, int]:
+        metres, angle = apart(glance.pose, pose)
+        return int(CHECKED * metres / (STEP * max(glance.typical_m, LEAST_M))), int(CHECKED * angle / TURN)
+
+    return parts(before) != parts(now)
 
 
 def is_frozen(in_sensor: int, in_world: int) -> bool:

@@ -17,7 +17,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
-from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, with_glance
+from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, moved_on, with_glance
 from stereovox.maps.record.glance import Glance
 from stereovox.maps.record.history import (
     MAX_NAME_LENGTH,
@@ -165,9 +165,12 @@ class Gate:
 
     def _glances(self, frame: AnyFrame | Scan, passed: GateResult, image: AnyImage) -> tuple[Glance, ...]:
         """Return the glances to keep. Raises FrameRefused for a frame that repeats a view from elsewhere."""
-        glances, ranges = self._history.glances.get(passed.sensor, ()), self._views.ranges(image)
-        before = self._history.trusted.get(passed.sensor)
-        if before is None or jumped(glances, before, passed.seen):
+        glances, before = self._history.glances.get(passed.sensor, ()), self._history.trusted.get(passed.sensor)
+        anew = not glances or before is None or jumped(glances, before, passed.seen)
+        if before is not None and not anew and not moved_on(glances[-1], before.pose, passed.seen.pose):
+            return glances
+        ranges = self._views.ranges(image)
+        if anew:
             glances = with_glance((), passed.seen, ranges)
         in_sensor, in_world = self._views.unmoved(glances, image.camera, image.T_world_sensor, ranges)
         if is_frozen(in_sensor, in_world) and _is_measured(frame):

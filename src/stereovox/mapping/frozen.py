@@ -90,6 +90,11 @@ class FrozenViews:
                 in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
         return in_sensor, in_world
 
+    def prepare(self, glance: Glance, camera: VirtualCamera | Lidar, ranges: NDArray[np.float32]) -> None:
+        """Compile with the first frame what later ones need."""
+        tolerance = self._tolerance(glance, camera)
+        place(ranges, marks_of(glance).sensor, AT_REST, tolerance, np.empty(len(tolerance), np.uint8))
+
     def _tolerance(self, glance: Glance, camera: VirtualCamera | Lidar) -> NDArray[np.float32]:
         """Return by how many metres the ranges of a glance's points may differ, (N,)."""
         if glance not in self._tolerances:

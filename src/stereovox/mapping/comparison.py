@@ -17,6 +17,7 @@ from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
+from stereovox.mapping.frozen import BLUR, FARTHEST
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
@@ -32,16 +33,12 @@ FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
 """Most points of a frame in doubt that a glance keeps, that are looked up in the map, and that faults are tried on."""
-BLUR = 1.5
-"""Tolerance between two glances, as a multiple of the tolerance to the map: both are noisy."""
 GAIN = 0.1
 """Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
 """A surface is seen through by points more than this many cells behind it; a floor at a flat angle is thick."""
 REACH = 60.0
 """Metres along a ray within which the map's first surface is sought."""
-FARTHEST = 10
-"""Points farther than this many times `max_range` do not count: a lidar may return any range."""
 
 MIRRORED = {
     "mirrored": (-1, 1, 1),

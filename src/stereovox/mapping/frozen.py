@@ -58,8 +58,8 @@ class FrozenViews:
     def ranges(self, image: AnyImage) -> NDArray[np.float32]:
         """Return the range in each direction, (SIDE, SIDE) metres, 0 for none."""
         if isinstance(image, CheckedCloud):
-            points = image.ends[:: max(1, -(-len(image.ends) // SAMPLED))]
-            points = points[image.hits[:: max(1, -(-len(image.ends) // SAMPLED))]]
+            some = slice(None, None, max(1, -(-len(image.ends) // SAMPLED)))
+            points = image.ends[some][image.hits[some]]
             with np.errstate(over="ignore"):
                 return binned(points[np.einsum("ni,ni->n", points, points) <= self._reach**2])
         ranges = np.zeros((SIDE, SIDE), np.float32)
@@ -90,7 +90,7 @@ class FrozenViews:
                 in_world += int(np.count_nonzero((moved == SAME) & (fixed != SAME)))
         return in_sensor, in_world
 
-    def prepare(self, glance: Glance, camera: VirtualCamera | Lidar, ranges: NDArray[np.float32]) -> None:
+    def warm_up(self, glance: Glance, camera: VirtualCamera | Lidar, ranges: NDArray[np.float32]) -> None:
         """Compile with the first frame what later ones need."""
         tolerance = self._tolerance(glance, camera)
         place(ranges, marks_of(glance).sensor, AT_REST, tolerance, np.empty(len(tolerance), np.uint8))

@@ -172,7 +172,7 @@ class Gate:
         ranges = self._views.ranges(image)
         if anew:
             glances = with_glance((), passed.seen, ranges)
-            self._views.prepare(glances[0], image.camera, ranges)
+            self._views.warm_up(glances[0], image.camera, ranges)
         in_sensor, in_world = self._views.unmoved(glances, image.camera, image.T_world_sensor, ranges)
         if is_frozen(in_sensor, in_world) and _is_measured(frame):
             counts = f"{in_sensor} points moved with the sensor, {in_world} stayed in the world"

@@ -55,6 +55,26 @@ def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> ND
     return image.astype(np.uint16, copy=False)
 
 
+def decode_rvl(path: Path | str, data: bytes, size: tuple[int, int] | None = None) -> NDArray[np.uint16]:
+    """Return the (height, width) uint16 image packed as RVL, after its columns and rows as uint32.
+
+    size: required (width, height); None: any. Raises FrameRefused as `decode_depth_png`.
+    """
+    from stereovox.sources._rvl import unpack
+
+    if len(data) < 8:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; leave it out")
+    width, height = found = struct.unpack_from("<2I", data)
+    if size is not None and found != size:
+        raise FrameRefused("bad_shape", f"{path}: {size_text(found)} pixels, its camera has {size_text(size)}")
+    if size is None and not 0 < width * height <= min(MAX_PIXELS, 1000 * len(data)):
+        raise FrameRefused("unreadable", f"{path}: is damaged; leave it out")
+    depth = np.empty(width * height, np.uint16)
+    if unpack(np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8), depth) != depth.size:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; leave it out")
+    return depth.reshape(height, width)
+
+
 def decode_png(
     path: Path | str, data: bytes, size: tuple[int, int] | None, kinds: Kinds, expected: str = ""
 ) -> NDArray[np.generic]:
@@ -63,7 +83,7 @@ def decode_png(
     size: required (width, height); None: any. expected: supported kinds, for the message.
     Raises FrameRefused as `decode_depth_png`.
     """
-    _check(path, data, size or _header_size(path, data, kinds, expected), kinds, expected)
+    _check(path, data, size or header_size(path, data, kinds, expected), kinds, expected)
     return _decode(path, data)
 
 
@@ -86,7 +106,7 @@ def read_picture_png(path: Path, size: tuple[int, int], kinds: Kinds = PICTURE_K
 
 def png_size(path: Path, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int]:
     """Return (width, height) from the header of a PNG of these kinds; raises FrameRefused as `decode_depth_png`."""
-    return _header_size(path, _read(path, header_only=True), kinds)
+    return header_size(path, _read(path, header_only=True), kinds)
 
 
 def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int] | None:
@@ -132,7 +152,7 @@ def _read(path: Path, header_only: bool = False) -> bytes:
 
 def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds, expected: str = "") -> None:
     """Raise FrameRefused unless `data` is a whole PNG of one of `kinds` and of this size."""
-    found = _header_size(path, data, kinds, expected)
+    found = header_size(path, data, kinds, expected)
     if found != size:
         raise FrameRefused(
             "bad_shape", f"{path}: {size_text(found)} pixels, the recording has {size_text(size)}; remove it"
@@ -141,7 +161,8 @@ def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds, e
         raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
 
 
-def _header_size(path: Path | str, data: bytes, kinds: Kinds, expected: str = "") -> tuple[int, int]:
+def header_size(path: Path | str, data: bytes, kinds: Kinds, expected: str = "") -> tuple[int, int]:
+    """Return (width, height) from the first bytes of a PNG; raises FrameRefused as `decode_depth_png`."""
     header = data[12 : HEADER_BYTES - 4]
     if data[:16] != START or zlib.crc32(header) != int.from_bytes(data[HEADER_BYTES - 4 : HEADER_BYTES]):
         raise FrameRefused("unreadable", f"{path}: not a PNG, or its header is damaged; copy it again or remove it")

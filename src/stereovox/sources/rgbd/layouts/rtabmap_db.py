@@ -9,7 +9,6 @@ import struct
 import zlib
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -20,10 +19,9 @@ from stereovox.errors import FrameRefused, SourceError, one_line
 from stereovox.geometry.se3 import Transform
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.calibration.intrinsics import scaled
-from stereovox.sources.images import MAX_BYTES, size_text
+from stereovox.sources.images import MAX_BYTES, decode_rvl, size_text
 from stereovox.sources.rgbd.depth_files import Depth, decode_depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
-from stereovox.sources.rgbd.layouts import _rvl
 from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.sources.sqlite_file import FAULTS, SqliteFile
 
@@ -205,7 +203,7 @@ class RtabmapDatabase(DepthFolder):
             content = self._sqlite.rows("SELECT depth FROM Data WHERE id = ?", node.id)[0][0]
         except FAULTS as error:
             raise FrameRefused("unreadable", f"{path}: {one_line(str(error))[:100]}; leave it out") from None
-        depth = _rvl_depth(path, content) if content.startswith(RVL) else decode_depth(path, content)
+        depth = decode_rvl(path, content[len(RVL) :]) if content.startswith(RVL) else decode_depth(path, content)
         width = depth.shape[1] // len(node.cameras)
         return cast("Depth", np.ascontiguousarray(depth[:, k * width : (k + 1) * width]))
 
@@ -283,18 +281,6 @@ def _unpacked(blob: bytes) -> NDArray[np.uint8]:
         return np.frombuffer(zlib.decompressobj().decompress(blob, MAX_BYTES), np.uint8)
     except zlib.error as error:
         raise ValueError(str(error)) from None
-
-
-def _rvl_depth(path: Path, content: bytes) -> Depth:
-    """Return the image packed as RVL, after its name and its columns and rows as uint32; raises FrameRefused."""
-    width, height = struct.unpack_from("<2I", content, 8) if len(content) >= 16 else (0, 0)
-    if not 0 < width * height <= MAX_BYTES // 2 or width * height > 1000 * len(content):
-        raise FrameRefused("unreadable", f"{path}: is damaged; leave it out")
-    words = np.frombuffer(content[16 : 16 + (len(content) - 16) // 4 * 4], "<u4")
-    depth = np.empty(width * height, np.uint16)
-    if _rvl.unpack(words, depth) != depth.size:
-        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; leave it out")
-    return depth.reshape(height, width)
 
 
 def _version(rows: list[Any]) -> tuple[int, ...]:

@@ -23,8 +23,8 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 607,
-    "lines": 91_600,
+    "modules": 606,
+    "lines": 91_550,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

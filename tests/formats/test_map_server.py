@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from stereovox.cli import main
 from stereovox.errors import MapFileError
+from stereovox.formats import import_map
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps.occupancy import OccupancyGrid
 
@@ -87,6 +89,38 @@ def test_unknown_cells_that_the_thresholds_make_free_are_noted(tmp_path, mode, n
             "3% of its pixels are grey 205, which map_saver writes for unknown cells; "
             "free_thresh 0.25 makes them free: correct it to 0.196 in the .yaml"
         )
+
+
+def said_by_info(path, _, capsys):
+    return main(["info", str(path)]), capsys.readouterr()
+
+
+def said_by_export(path, folder, capsys):
+    return main(["export", str(path), str(folder / "floor.bag")]), capsys.readouterr()
+
+
+def said_by_eval(path, _, capsys):
+    return main(["eval", str(path), str(path)]), capsys.readouterr()
+
+
+def said_by_copying(path, folder, capsys):
+    return main(["import", str(path), str(folder / "copy.yaml")]), capsys.readouterr()
+
+
+def said_by_raising(path, *_):
+    return import_map(path, heights=(0, 1)).history.imported.notes
+
+
+DOORS = said_by_info, said_by_export, said_by_eval, said_by_copying, said_by_raising
+
+
+@pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
+@pytest.mark.parametrize("free_thresh", [0.25, 0.196])
+def test_who_reads_such_a_map_is_told(door, free_thresh, tmp_path, capsys):
+    pixels = np.full((10, 10), 254)
+    pixels[0, :3], pixels[5, 5] = 205, 0
+    path = made_map(tmp_path, pixels, free_thresh=free_thresh)
+    assert ("grey 205" in str(door(path, tmp_path, capsys))) == (free_thresh == 0.25)
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 2-D map of a node follows its map: through a reset, a load, and a load that is refused."""
 
+from types import SimpleNamespace
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from made_walks import depth_at
@@ -8,8 +11,12 @@ from made_walks import depth_at
 from stereovox import VoxelMap
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
+from stereovox.formats.map_server import write_map_server
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.products.floor.projection import project
 from stereovox.ros.mapping import Mapping
+from stereovox.ros.options import Options
+from stereovox.ros.score import score_of
 
 STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}
 """The walk's images show no floor: its world stands on it."""
@@ -52,3 +59,29 @@ def test_what_cannot_be_saved_is_one_line(tmp_path):
         with pytest.raises(StereovoxError):
             mapping.save(name)
     mapping.close()
+
+
+def said_by_loading(path):
+    said = []
+    Mapping(load_config(dimensions=2, voxel_size=0.1), notify=said.append).load(path)
+    return said
+
+
+def said_by_scoring(path):
+    said = []
+    node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=said.append))
+    with patch("stereovox.ros.score.Score"):
+        score_of(node, None, Options(reference=path))
+    return said
+
+
+@pytest.mark.parametrize("door", [said_by_loading, said_by_scoring])
+@pytest.mark.parametrize("free_thresh", ["0.25", "0.196"])
+def test_unknown_cells_that_a_file_makes_free_are_reported(door, free_thresh, tmp_path):
+    file, cells = tmp_path / "map.yaml", np.zeros((10, 10), np.int8)
+    cells[0, :3], cells[5, 5] = UNKNOWN, 100
+    write_map_server(OccupancyGrid(cells, 0.1), file)
+    text = file.read_text()
+    assert "free_thresh: 0.196" in text
+    file.write_text(text.replace("free_thresh: 0.196", f"free_thresh: {free_thresh}"))
+    assert ("grey 205" in str(door(str(file)))) == (free_thresh == "0.25")

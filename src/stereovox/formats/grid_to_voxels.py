@@ -45,7 +45,9 @@ def read_raised_floor(path: str | Path, heights: Sequence[float] | None = None) 
         raise MapFileError(f"{path}: {error}") from None
     rows, columns = grid.cells.shape
     note = f"its cells are columns from {low:g} to {high:g} m: heights that the file does not have"
-    made.history.imported = Imported(Path(path).name, f"map_server, {columns} x {rows} cells", (note,))
+    made.history.imported = Imported(
+        Path(path).name, f"map_server, {columns} x {rows} cells", (note, *filter(None, [grid.note]))
+    )
     return made
 
 

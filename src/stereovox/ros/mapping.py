@@ -113,6 +113,8 @@ class Mapping:
         """Continue a saved map; raises StereovoxError, and changes nothing, if that is impossible."""
         if self.config.dimensions == 2:
             floor = read_map_server(path)
+            if floor.note:
+                self._notify(f"{path}: {floor.note}")
             self._begin_floor(load_config(self.config, voxel_size=floor.resolution), floor)
         else:
             saved = load_map(path)

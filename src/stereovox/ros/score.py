@@ -31,7 +31,12 @@ def error_of(grid: OccupancyGrid, reference: OccupancyGrid, exclude: Sequence[Re
 def score_of(node: Any, mapping: Mapping, options: Options) -> Score | None:
     """Return the comparison of the map with the options' reference, None without one; raises StereovoxError."""
     file = options.reference or options.floor
-    return Score(node, mapping, read_map_server(file), [region_of(text) for text in options.exclude]) if file else None
+    if not file:
+        return None
+    reference = read_map_server(file)
+    if reference.note:
+        node.get_logger().warning(f"{file}: {reference.note}")
+    return Score(node, mapping, reference, [region_of(text) for text in options.exclude])
 
 
 class Score:

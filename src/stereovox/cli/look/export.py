@@ -12,7 +12,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.maps import dimensions, open_map, refuse_options
+from stereovox.cli.maps import dimensions, open_grid, open_map, refuse_options
 from stereovox.cli.options import heights_of, point
 from stereovox.cli.terminal import say, size
 
@@ -90,9 +90,8 @@ def _format_floor(floor: FloorHeights) -> str:
 def _export_floor(arguments: Namespace) -> dict[str, Any]:
     """Write a floor map to a bag."""
     from stereovox.formats.bags import write_grid_bag
-    from stereovox.formats.map_server import read_map_server
 
     refuse_options(arguments, ["heights", "inflate", "floor", "start"], "a floor map is written to a bag unchanged")
-    write_grid_bag(read_map_server(arguments.map), arguments.file)
+    write_grid_bag(open_grid(arguments.map), arguments.file)
     say(f"saved {arguments.file}")
     return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}

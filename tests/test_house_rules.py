@@ -104,7 +104,7 @@ def test_a_habit_is_found(tmp_path):
 
 def probes_of_sources(text):
     """Yield the lines of a module that ask whether a source has something: `stream_of` has settled that on opening."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(ast.parse(text)) if "attr(" in text else ():
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("getattr", "hasattr"):
             asked = node.args[1].value if len(node.args) > 1 and isinstance(node.args[1], ast.Constant) else None
             if asked in MEMBERS - OF_OTHERS:

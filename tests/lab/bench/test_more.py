@@ -264,6 +264,8 @@ def test_a_path_that_is_too_short_is_refused():
 def test_every_measurement_has_a_table(monkeypatch):
     """All by name, as `--all` calls them, the long ones made short."""
     monkeypatch.setattr(growth, "ROUNDS", 1)
+    coarse = {"voxel_size": 0.4, "max_range": 2.0}
+    monkeypatch.setattr(growth, "MAPS", {name: {**settings, **coarse} for name, settings in growth.MAPS.items()})
     monkeypatch.setattr(
         start, "_first_frame", lambda *_: {"s": 1.0, "add_s": 0.5, "all_s": 1.5, "last_s": 0.1, "occupied": 1}
     )

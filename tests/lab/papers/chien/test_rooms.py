@@ -41,10 +41,14 @@ def perfect(face_cells):
     return map_of(cells), np.unique(keys(cells))
 
 
-def test_a_perfect_map_is_thin_straight_and_square(stage, perfect):
-    voxel_map, seen = perfect
-    found = measure_rooms("perfect", voxel_map, stage, seen)
-    figures = found.figures()
+@pytest.fixture(scope="module")
+def measured(stage, perfect):
+    """The rooms of the perfect map."""
+    return measure_rooms("perfect", perfect[0], stage, perfect[1])
+
+
+def test_a_perfect_map_is_thin_straight_and_square(measured):
+    figures = measured.figures()
     assert figures["walls"] == 24
     assert figures["missing"] == {}
     assert figures["solid_share"] == figures["found"]
@@ -75,15 +79,14 @@ def test_the_far_side_of_an_inner_wall_is_another_rooms(stage, face_cells, perfe
         assert abs(found.offset) < SIZE
 
 
-def test_a_wall_that_was_seen_and_is_not_there_makes_the_walls_less_than_solid(stage, face_cells, perfect):
+def test_a_wall_that_was_seen_and_is_not_there_makes_the_walls_less_than_solid(stage, face_cells, perfect, measured):
     lost = "kitchen east"
     cells = np.concatenate([cells for name, cells in face_cells.items() if name != lost])
     found = measure_rooms("without", map_of(np.unique(cells, axis=0)), stage, perfect[1])
-    whole = measure_rooms("perfect", perfect[0], stage, perfect[1])
-    assert found.missing == {lost: whole.walls[lost].columns}
+    assert found.missing == {lost: measured.walls[lost].columns}
     figures = found.figures()
     assert figures["found"] > 0.95
-    assert figures["solid_share"] < 0.97 * whole.figures()["solid_share"]
+    assert figures["solid_share"] < 0.97 * measured.figures()["solid_share"]
 
 
 def test_a_map_without_walls_is_refused_in_one_line(stage, perfect):
@@ -91,8 +94,8 @@ def test_a_map_without_walls_is_refused_in_one_line(stage, perfect):
         measure_rooms("empty", VoxelMap(load_config(voxel_size=SIZE)), stage, perfect[1])
 
 
-def test_a_turned_wall_turns_two_corners(stage, perfect):
-    walls = measure_rooms("perfect", perfect[0], stage, perfect[1]).outer
+def test_a_turned_wall_turns_two_corners(measured):
+    walls = measured.outer
     turn = np.radians(3)
     west = walls["west"]
     x, y, z = west.normal

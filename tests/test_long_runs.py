@@ -3,8 +3,6 @@
 
 import gc
 import json
-import subprocess
-import sys
 import weakref
 from dataclasses import replace
 
@@ -59,7 +57,7 @@ def scans(frames):
         yield Scan(kinds[n % 5], -1.5, 0.03, 0.1, 4.0, pose, stamp_ns=frame.stamp_ns, **given)
 
 
-source, settings = json.loads(sys.argv[1])
+source, settings = GIVEN
 grid, settings = settings.pop("grid", False), {"voxel_size": 0.1, "trust.ordered": False, **settings}
 frames = [replace(f, depth=(f.depth * f.depth_scale).astype(np.float32), depth_scale=1.0, reason=None)
           if hasattr(f, "depth") else f for f in sv.open_source(source, ":60:5")]
@@ -97,11 +95,12 @@ WINDOW = {"window.size": (4, 4, 3), "map.keep_times": True}
     ],
     ids=["projective", "deadline", "window", "tiles", "ray", "stereo", "grid"],
 )
-def test_nothing_is_compiled_after_the_first_frame_of_a_camera(source, settings):
-    command = [sys.executable, "-c", LATER_KERNELS, json.dumps([source, settings])]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
+def test_nothing_is_compiled_after_the_first_frame_of_a_camera(source, settings, tmp_path, run_script):
+    """In processes forked from one that has imported what they need, and compiled or loaded no kernel."""
+    (tmp_path / "later.py").write_text(LATER_KERNELS.replace("GIVEN", repr((source, settings))))
+    status, said = run_script(tmp_path / "later.py")
+    assert status == 0, said
+    told = json.loads(said.splitlines()[-1])
     assert told["cameras"] == (4 if source.startswith("sim:surround") else 1)
     assert told["later"] == []
     if "deadline_ms" in settings:

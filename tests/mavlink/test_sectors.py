@@ -11,24 +11,24 @@ from stereovox.mavlink.sectors import UNKNOWN, SectorRules, obstacle_sectors
 EXACT = SectorRules(max_distance=4.0, half_height=0.25, overlap_deg=0, own_radius=0)
 
 
-def sampled(voxel_map, T_world_body, rules, states, wider_deg):
-    """Nearest place in one of `states` on dense rays in each sector, made wider by so much: the obvious way."""
+def sampled(voxel_map, T_world_body, rules, kinds, wider_deg):
+    """Nearest place in each kind of states on dense rays in each sector, made wider by so much: the obvious way."""
     half = 2.5 + rules.overlap_deg + wider_deg
     forward, down = T_world_body[:3, 2].copy(), np.array([0.0, 0, -1])
     forward[2] = 0
     forward /= np.linalg.norm(forward)
     right = np.cross(down, forward)
     away = np.arange(0.0, rules.max_distance, 0.01)
-    heights = np.linspace(-rules.half_height, rules.half_height, 7)[:, None, None] * [0, 0, 1]
-    found = np.full(72, np.inf)
+    heights = np.linspace(-rules.half_height, rules.half_height, 7)[:, None, None, None] * [0, 0, 1]
+    found = np.full((len(kinds), 72), np.inf)
     for i in range(72):
-        for angle in np.radians(5 * i + np.linspace(-half, half, 31)):
-            flat = np.cos(angle) * forward + np.sin(angle) * right
-            points = T_world_body[:3, 3] + away[:, None] * flat
-            seen = voxel_map.state((points + heights).reshape(-1, 3)).reshape(7, -1)
+        angles = np.radians(5 * i + np.linspace(-half, half, 31))[:, None, None]
+        points = T_world_body[:3, 3] + away[:, None] * (np.cos(angles) * forward + np.sin(angles) * right)
+        seen = voxel_map.state((points + heights).reshape(-1, 3)).reshape(7 * 31, -1)
+        for n, states in enumerate(kinds):
             hit = np.flatnonzero(np.isin(seen, states).any(axis=0))
             if len(hit):
-                found[i] = min(found[i], away[hit[0]])
+                found[n, i] = away[hit[0]]
     return found
 
 
@@ -43,12 +43,10 @@ def test_sectors_are_what_dense_rays_find(seed):
     overlap = [0, 5][seed % 2]
     rules = SectorRules(max_distance=3.0, half_height=0.25, overlap_deg=overlap, own_radius=0)
     found = obstacle_sectors(voxel_map, T, rules)
-    for ours, states in (
-        (found.obstacle_m, [State.OCCUPIED, State.TENTATIVE]),
-        (found.unknown_m, [State.UNKNOWN]),
-    ):
+    kinds = [[State.OCCUPIED, State.TENTATIVE], [State.UNKNOWN]]
+    narrower, wider = (sampled(voxel_map, T, rules, kinds, wider_deg) for wider_deg in (0, 0.5))
+    for ours, narrow, wide in zip((found.obstacle_m, found.unknown_m), narrower, wider, strict=True):
         assert np.isfinite(ours).sum() > 10
-        narrow, wide = (sampled(voxel_map, T, rules, states, wider) for wider in (0, 0.5))
         assert (ours <= narrow + 1e-9).all()  # never farther than anything that is there
         assert (ours >= np.where(np.isinf(wide), rules.max_distance, wide) - np.hypot(CELL, CELL) - 0.02).all()
 

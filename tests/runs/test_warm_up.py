@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 CODE = """
@@ -60,11 +57,11 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_what_was_warmed_up_compiles_nothing_once_it_runs(way):
+def test_what_was_warmed_up_compiles_nothing_once_it_runs(way, tmp_path, run_script):
     if way == "slam":
         pytest.importorskip("gtsam", reason="gtsam is not installed: pip install 'stereovox[slam]'")
     before, then = WAYS[way]
-    code = CODE.format(before=before, then=then)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "[]"
+    (tmp_path / "warm.py").write_text(CODE.format(before=before, then=then))
+    status, said = run_script(tmp_path / "warm.py")
+    assert status == 0, said
+    assert said.splitlines()[-1] == "[]"

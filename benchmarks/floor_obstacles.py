@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import stereovox as sv
+from stereovox.formats.map_server import read_map_server
 from stereovox.geometry.se3 import look_at
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.floor.projection import project
@@ -291,6 +292,17 @@ def kitchen(folder: str) -> None:
                 )
 
 
+def live(folder: str) -> None:
+    """Judge the grids that live runs write, with the recording's poses and tracked, as `kitchen` does."""
+    for poses, heights in product(("given", "track"), (BAND, LOWER)):
+        with TemporaryDirectory() as place:
+            grid = Path(place) / "floor.yaml"
+            found = sv.map_live(folder, Path(place) / "map.svox", poses=poses, grid=grid, heights=heights).map
+            truth = truth_of_plane(found, heights)
+            print(f"{Path(folder).name}, live, {poses}, {heights[0]:g} to {heights[1]:g} m, {found.frames} images")
+            print(f"  written: {score(read_map_server(grid), truth)}", flush=True)
+
+
 def truth_of_plane(voxel_map: sv.VoxelMap, heights: tuple[float, float]) -> Truth:
     """Return the columns with occupied cells between two heights above the plane of most of the lowest ones."""
     occupied, random, side = voxel_map.occupied(), np.random.default_rng(0), voxel_map.voxel_size
@@ -348,6 +360,7 @@ def main() -> None:
         print(f"all, {name:18} {total}")
     if options.kitchen:
         kitchen(options.kitchen)
+        live(options.kitchen)
 
 
 if __name__ == "__main__":

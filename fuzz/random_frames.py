@@ -33,7 +33,8 @@ CLOUD_DTYPES = ("f4", "f4", "f8", "f2", "i4", ">f4")
 LIDARS = (sv.Lidar(), sv.Lidar(), sv.Lidar(0.02, 0.0, 3.0), sv.Lidar(1e-9, 0.1), sv.Lidar(5.0, 0.0, 1e12))
 ROOM_M = np.array([4.0, 3.0, 2.5])
 """Half size of the room shown in plausible images."""
-CAMERAS = 60
+CAMERAS, REPLACED = 6, 0.02
+"""Cameras in use, and how often one is replaced: a mapper makes tables for each new camera, which takes longest."""
 LARGE = 0.003
 """Share of depth images of realistic size."""
 SENSORS = ("", "", "", "left", "right", "lidar 1")
@@ -171,11 +172,11 @@ class Maker:
         return T
 
     def _camera(self) -> VirtualCamera:
-        """Return one of a few dozen cameras, because a robot has few; occasionally one is replaced."""
+        """Return one of a few cameras, as a robot has; occasionally one is replaced."""
         if self._chance(LARGE):
             return self._shapes.large()
         number = int(self._rng.integers(CAMERAS))
-        if self._chance():
+        if self._chance(REPLACED):
             self._cameras[number] = self._shapes.camera()
         return self._cameras[number]
 

@@ -9,6 +9,7 @@ from subprocess import PIPE, Popen
 
 import numpy as np
 import pytest
+from floor_obstacles import built_in, score, truth_of
 from made_live import CAMERA, wall
 
 from stereovox.cameras.pinhole import PinholeCamera
@@ -23,6 +24,8 @@ from stereovox.live.recorder import WAITING, Recorder, optical, topic
 from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
+from stereovox.products.floor import live_projection
+from stereovox.simulate.simulation import Simulation
 from stereovox.sources.bags.writer import BagWriter
 
 MS = 1_000_000
@@ -47,6 +50,33 @@ def test_the_2d_map_is_written_while_it_grows_and_complete_at_the_end(tmp_path):
     found = read_map_server(tmp_path / "g.yaml")
     assert (found.cells == 100).sum() > 5
     assert (found.cells == 0).sum() > 50
+
+
+@pytest.mark.parametrize("off_m", [0.0, -1.0, 1.0])
+def test_what_stands_on_the_true_floor_is_not_free_in_the_written_2d_map(tmp_path, monkeypatch, off_m):
+    """The camera begins 1.3 m above the floor, at z = 0. A floor that is 1 m off fails the same test."""
+    simulation, find = Simulation("sim:room?image_width=96", frames=80), live_projection.find_floor
+
+    def wrong(voxel_map):
+        floor = find(voxel_map)
+        return replace(floor, height=floor.height + np.float32(off_m))
+
+    monkeypatch.setattr(live_projection, "find_floor", wrong)
+    origin = simulation.true_pose(0)[:3, 3].copy()
+    mapper = Mapper(voxel_size=0.1)
+    grid = GridFile(mapper, tmp_path / "g.yaml", period_s=0.0)
+    for k in range(80):
+        T = simulation.true_pose(k).copy()
+        T[:3, 3] -= origin
+        made = replace(simulation.frame(k), T_world_sensor=T)
+        grid.after(made, mapper.add(made))
+    grid.finish()
+    grid.close()
+    world = built_in("room?image_width=96", 80)
+    found = score(read_map_server(tmp_path / "g.yaml"), truth_of(mapper.map, world, origin))
+    assert found.obstacles > 100
+    good = found.called_free <= 0.005 * found.obstacles and found.stays_free > 0.1 * found.floor
+    assert good == (off_m == 0), found
 
 
 def test_a_2d_map_that_cannot_be_written_does_not_end_the_run(tmp_path):

@@ -61,14 +61,15 @@ class StampClock:
     def heard(self, source: str, stamp_ns: int, now_ns: int) -> None:
         """Take note that something with a stamp came from a source (a sensor, the poses) at `now_ns`."""
         with self._lock:
-            if stamp_ns < self._last.get(source, stamp_ns) - RESET_NS:
-                self._forget()
-            if source not in self._last:
+            if (last := self._last.get(source)) is None or stamp_ns < last - RESET_NS:
+                if last is not None:
+                    self._forget()
                 self._recognise(stamp_ns, now_ns)
             self._last[source] = stamp_ns
             if self._newest is None or stamp_ns >= self._newest[0]:
                 self._newest = stamp_ns, now_ns
-            offsets = self._offsets.setdefault(source, deque(maxlen=CONFIRMED))
+            if (offsets := self._offsets.get(source)) is None:
+                offsets = self._offsets[source] = deque(maxlen=CONFIRMED)
             offsets.append(now_ns - stamp_ns)
             if len(offsets) == CONFIRMED:
                 self._least = min(max(offsets), self._least_at(now_ns)), now_ns

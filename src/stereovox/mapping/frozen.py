@@ -8,6 +8,7 @@ is compared with earlier glances from other poses: which of their points are unm
 from __future__ import annotations
 
 from functools import partial
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ FARTHEST = 10
 """Points farther than this many times `max_range` do not count: a lidar may report any distance."""
 BLUR = 1.5
 """Tolerance between two frames, as a multiple of the noise of one: both are noisy."""
-STEP, TURN = 0.1, np.radians(8)
+STEP, TURN = 0.1, radians(8)
 """A glance is kept once the sensor has moved by this share of the median distance in view, or turned by this angle."""
 CHECKED = 4
 """How often frames are compared within such a step; those between two comparisons have hardly moved."""
@@ -114,12 +115,9 @@ def _turned_back(T: Transform) -> NDArray[np.float32]:
 
 def moved_on(glance: Glance, before: tuple[float, ...], now: tuple[float, ...]) -> bool:
     """Return whether the sensor is another CHECKED part of a step away from a glance than it was before."""
-
-    def parts(pose: tuple[float, ...]) -> tuple[int, int]:
-        metres, angle = apart(glance.pose, pose)
-        return int(CHECKED * metres / (STEP * max(glance.typical_m, LEAST_M))), int(CHECKED * angle / TURN)
-
-    return parts(before) != parts(now)
+    (metres, angle), (metres_now, angle_now) = apart(glance.pose, before), apart(glance.pose, now)
+    part_m, part = STEP / CHECKED * max(glance.typical_m, LEAST_M), TURN / CHECKED
+    return metres // part_m != metres_now // part_m or angle // part != angle_now // part
 
 
 def is_frozen(in_sensor: int, in_world: int) -> bool:
@@ -132,14 +130,16 @@ def jumped(glances: tuple[Glance, ...], before: StampedPose, now: StampedPose) -
 
     Its step is large, and HASTE times faster than the sensor moved from the last glance to `before`.
     """
-    earlier = [glance for glance in glances if glance.stamp_ns < before.stamp_ns]
-    if not earlier or now.stamp_ns <= before.stamp_ns:
+    last = next((one for one in reversed(glances) if one.stamp_ns < before.stamp_ns), None)
+    if last is None or now.stamp_ns <= before.stamp_ns:
         return False
-    last = earlier[-1]
-    share = (now.stamp_ns - before.stamp_ns) / (before.stamp_ns - last.stamp_ns)
-    least = STEP / 2 * last.typical_m, TURN / 2
-    steps = zip(apart(before.pose, now.pose), apart(last.pose, before.pose), least, strict=True)
-    return any(step >= large and step > HASTE * share * usual for step, usual, large in steps)
+    step_m, step = apart(before.pose, now.pose)
+    large_m, large = step_m > STEP / 2 * last.typical_m, step > TURN / 2
+    if not (large_m or large):
+        return False
+    usual_m, usual = apart(last.pose, before.pose)
+    haste = HASTE * (now.stamp_ns - before.stamp_ns) / (before.stamp_ns - last.stamp_ns)
+    return (large_m and step_m > haste * usual_m) or (large and step > haste * usual)
 
 
 def with_glance(glances: tuple[Glance, ...], now: StampedPose, ranges: NDArray[np.float32]) -> tuple[Glance, ...]:

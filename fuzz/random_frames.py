@@ -33,8 +33,8 @@ CLOUD_DTYPES = ("f4", "f4", "f8", "f2", "i4", ">f4")
 LIDARS = (sv.Lidar(), sv.Lidar(), sv.Lidar(0.02, 0.0, 3.0), sv.Lidar(1e-9, 0.1), sv.Lidar(5.0, 0.0, 1e12))
 ROOM_M = np.array([4.0, 3.0, 2.5])
 """Half size of the room shown in plausible images."""
-CAMERAS, REPLACED = 6, 0.02
-"""Cameras in use, and how often one is replaced: a mapper makes tables for each new camera, which takes longest."""
+CAMERAS = 6
+"""Cameras in use. A mapper makes tables for each new camera, which takes longest; it keeps those of 16."""
 LARGE = 0.003
 """Share of depth images of realistic size."""
 SENSORS = ("", "", "", "left", "right", "lidar 1")
@@ -176,7 +176,7 @@ class Maker:
         if self._chance(LARGE):
             return self._shapes.large()
         number = int(self._rng.integers(CAMERAS))
-        if self._chance(REPLACED):
+        if self._chance():
             self._cameras[number] = self._shapes.camera()
         return self._cameras[number]
 

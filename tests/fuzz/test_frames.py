@@ -13,7 +13,7 @@ import pytest
 import frames as fuzz
 import stereovox as sv
 import watched
-from mapper_kinds import KINDS, Kind
+from mapper_kinds import KINDS, SELDOM, Kind
 from random_cameras import RandomCameras
 from random_frames import Maker, room_depth
 from stereovox.frame import Frame
@@ -25,7 +25,11 @@ def test_nothing_crashes_and_no_refused_frame_changes_a_map():
     assert tally.changed_by_refused == 0
     assert set(tally.frames) == {"Frame", "StereoFrame", "Scan", "Cloud", "nonsense"}
     assert sum(tally.taken.values()) > 400
-    assert len(tally.taken) == len(KINDS)
+    often = {kind.name for kind in KINDS if kind.share > SELDOM}
+    assert often <= set(tally.taken)
+    seldom = fuzz.run(60, seed=7, timed_from=60, kinds=[kind for kind in KINDS if kind.share <= SELDOM])
+    assert seldom.bad == []
+    assert often | set(seldom.taken) == {kind.name for kind in KINDS}
     assert len(tally.refused) > 15
 
 

@@ -112,7 +112,12 @@ def entrance() -> list[Mutation]:
         ),
         Mutation("mount_not_rigid, scan", fields, "    if error > rigidity:", "    if False:"),
         Mutation("bad_form, masked", fields, "isinstance(getattr(seen, name), np.ma.MaskedArray)", "False"),
-        Mutation("bad_scale, image", prepare, 'depth.dtype.kind == "u" and isnan', "False and isnan"),
+        Mutation(
+            "bad_scale, image",
+            prepare,
+            "    if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:",
+            "    if False:",
+        ),
         Mutation("bad_reason, image", prepare, "frame.reason is not None and not _are", "False and not _are"),
     ]
 
@@ -363,6 +368,7 @@ class Changed:
             raise SystemExit(f"{one.cell}: {one.path} has its text {text.count(one.old)} times")
         before, after = (dict(_functions(compile(t, file, "exec"))) for t in (text, text.replace(one.old, one.new)))
         self._codes = {name: code for name, code in after.items() if code != before.get(name)}
+        gc.unfreeze()  # frozen objects are not listed
         self._found = [
             function
             for function in gc.get_objects()

@@ -351,7 +351,10 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("mount_too_far", 0): _posed(lambda T: _at(T, 0, 3, 2e6), "T_base_sensor"),
     ("pose_extrapolated", 0): _changed(pose_off_ns=10**9),
     ("stamp_backwards", 0): _after(lambda frame: replace(frame, stamp_ns=99 * 10**8)),
-    ("clock_reset", 0): _after(lambda frame: replace(frame, stamp_ns=10**8)),
+    ("clock_reset", 0): lambda kind: [
+        *_after(lambda frame: replace(frame, stamp_ns=10**8))(kind),
+        *_after(lambda frame: replace(frame, stamp_ns=frame.stamp_ns + 3601 * 10**9))(kind),
+    ],
     ("pose_jump", 0): _after(lambda frame: replace(frame, T_world_sensor=_moved(frame.T_world_sensor, 50))),
     ("frozen_image", 0): lambda kind: [
         Case(good(kind, 0, stamp_ns=10**8, T_world_sensor=_moved(good(kind).T_world_sensor, 0.1)), [good(kind, 0)])

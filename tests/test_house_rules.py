@@ -24,13 +24,13 @@ COMMANDS = {
 
 MOST = {
     "modules": 606,
-    "lines": 91_550,
+    "lines": 92_550,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 86,
     "lines of the laboratory": 12_850,
-    "words of README and docs": 38_100,
+    "words of README and docs": 38_250,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

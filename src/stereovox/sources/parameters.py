@@ -10,7 +10,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stereovox.errors import SourceError, did_you_mean
+from stereovox.geometry.se3 import Transform, rotation_matrix
 
 SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
 LARGEST = 2**63
@@ -70,3 +73,20 @@ def _value(key: str, text: str, known: Mapping[str, Any]) -> Any:
     if kind is int and abs(value) > LARGEST:
         raise SourceError(f"{key}={text} is too large")
     return value
+
+
+def mounted(key: str, text: str) -> Transform | None:
+    """Parse `x,y,z,yaw,pitch,roll` as T_body_sensor (4, 4), None for ""; raises SourceError for anything else."""
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not (3 <= len(numbers) <= 6 and np.isfinite(numbers).all()):
+        raise SourceError(f"{key}={text} must be x,y,z,yaw in metres and radians; pitch and roll may follow")
+    yaw, pitch, roll = (*numbers[3:], 0.0, 0.0, 0.0)[:3]
+    T = np.eye(4)
+    T[:3, :3] = rotation_matrix([0, 0, yaw]) @ rotation_matrix([0, pitch, 0]) @ rotation_matrix([roll, 0, 0])
+    T[:3, 3] = numbers[:3]
+    return T

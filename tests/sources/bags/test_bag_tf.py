@@ -110,7 +110,10 @@ def test_a_topic_that_is_named_comes_first_and_is_told_of(tmp_path):
     source = Bag(path)
     assert "/tf (odom -> optical): these poses are used; ?poses=/vicon for others" in source.notes[0]
     np.testing.assert_allclose(source.frame(1).T_world_sensor, planar_motion(1, 0, 0.2) @ T_BASE_OPTICAL, atol=1e-9)
-    np.testing.assert_allclose(Bag(f"{path}?poses=/vicon").frame(1).T_world_sensor, planar_motion(0, 7, 0))
+    T = Bag(f"{path}?poses=/vicon").frame(1).T_world_sensor  # of base_link, on which /tf_static mounts the camera
+    np.testing.assert_allclose(T, planar_motion(0, 7, 0) @ T_BASE_OPTICAL, atol=1e-9)
+    T = Bag(f"{path}?poses=/vicon&axes=optical").frame(1).T_world_sensor  # unless the user knows better
+    np.testing.assert_allclose(T, planar_motion(0, 7, 0), atol=1e-9)
     np.testing.assert_array_equal(Bag(f"{path}?pose=fixed").frame(1).T_world_sensor, np.eye(4))
     np.testing.assert_allclose(tracker_poses(path, "optical", "file").at(START_NS)[1, 3], 7)  # of a pair: never /tf
     for query in ("poses=/vicon&world_frame=odom", "pose=fixed&world_frame=odom"):
@@ -124,7 +127,13 @@ def test_without_tf_a_topic_counts_as_before_and_no_world_can_be_named(tmp_path)
             stamp_ns = START_NS + k * 90 * MS
             bag.add("/vicon", "nav_msgs/Odometry", stamp_ns, bag.odometry(stamp_ns, planar_numbers(0, 7, 0)))
         bag.depth(2)
-    assert Bag(bag.path).frame(0).fault is None
+    frame = Bag(bag.path).frame(0)
+    assert frame.fault == "no_pose"  # of base_link, and nobody knows where the camera is on it
+    assert (
+        "poses of 'base_link', and nothing in /tf connects it with the sensor's frame 'optical'" in frame.fault_detail
+    )
+    assert "?axes=ros" in frame.fault_detail
+    assert Bag(f"{bag.path}?axes=ros").frame(0).fault is None
     with pytest.raises(SourceError, match="has no /tf; leave"):
         Bag(f"{bag.path}?world_frame=odom")
 
@@ -162,3 +171,23 @@ def test_messages_that_cannot_be_read_are_counted(tmp_path):
     tf = read_tf(open_bag(walk(tmp_path / "a.bag", more=broken)))
     assert tf.notes == (f"{tmp_path / 'a.bag'} /tf: 1 messages cannot be read and were left out",)
     assert tf.connected("odom", "optical")
+
+
+@ENDINGS
+@pytest.mark.parametrize("kind", ["nav_msgs/Odometry", "geometry_msgs/TransformStamped"])
+def test_poses_of_the_base_lead_to_the_camera_through_tf_static(tmp_path, ending, kind):
+    with RobotBagMaker(tmp_path / f"a{ending}") as bag:
+        bag.tf(START_NS, "base_footprint", "base_link", [0, 0, 0.2, 0, 0, 0, 1], "/tf_static")
+        bag.tf(START_NS, "base_link", "optical", OPTICAL, "/tf_static")
+        for k in range(-1, 4):
+            stamp_ns = START_NS + k * 100 * MS + 50 * MS
+            numbers = planar_numbers(k + 0.5, 0, 0.2 * (k + 0.5))
+            stamped = bag.transforms((stamp_ns, "odom", "base_link", numbers)).transforms[0]
+            message = bag.odometry(stamp_ns, numbers) if kind.endswith("Odometry") else stamped
+            bag.add("/odom", kind, stamp_ns, message)
+        bag.depth(3)
+    source = Bag(bag.path)
+    for k, frame in enumerate(source):
+        assert frame.fault is None
+        np.testing.assert_allclose(frame.T_world_sensor, planar_motion(k, 0, 0.2 * k) @ T_BASE_OPTICAL, atol=1e-9)
+    assert "poses of base_link are used, with the mount of optical on it from /tf" in source.notes[0]

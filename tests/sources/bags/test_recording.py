@@ -12,6 +12,7 @@ from stereovox.errors import SourceError
 from stereovox.geometry.se3 import from_quaternion
 from stereovox.opening import open_source
 from stereovox.sources.bags.recording import Bag as BagSource
+from stereovox.sources.poses.trajectory import write_trajectory
 
 TOPIC = "/camera/depth/image_rect_raw"
 INFO = "/camera/depth/camera_info"
@@ -123,19 +124,32 @@ def test_poses_are_interpolated_at_the_image(tmp_path, kind):
     assert bool(source.notes) is not named
 
 
-def test_another_body_is_noted_and_its_axes_can_be_told(tmp_path):
+def test_another_body_is_refused_and_its_axes_can_be_told(tmp_path):
     with Bag(tmp_path / "a.bag") as bag:
         bag.add(TOPIC, "sensor_msgs/Image", stamp(0), image(depth(0), "16UC1", stamp(0), "/optical"))
         bag.add(INFO, "sensor_msgs/CameraInfo", stamp(0), camera_info())
         odometry = posed("nav_msgs/Odometry", stamp(0), (1, 2, 3, 0, 0, 0, 1), child="base_link")
         bag.add("/odom", "nav_msgs/Odometry", stamp(0), odometry)
-    assert "optical frame" in BagSource(bag.path).notes[0]
+    assert BagSource(bag.path).frame(0).fault == "no_pose"
     source = BagSource(f"{bag.path}?axes=ros")
     assert source.notes == ()
     T = source.frame(0).T_world_sensor
     np.testing.assert_allclose(T[:3, 3], [1, 2, 3])
     np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # forward is the body's x
     np.testing.assert_allclose(T[:3, :3] @ [1, 0, 0], [0, -1, 0], atol=1e-12)  # right is minus y
+
+
+def test_poses_come_from_a_file_too(tmp_path):
+    path = ros_bag(tmp_path / "a.bag", 3)
+    T = np.array([from_quaternion([k, 2.0 * k, 0], NUMBERS[3:]) for k in range(3)])
+    write_trajectory(tmp_path / "slam.tum", [stamp(k) for k in range(3)], T, "camera")
+    np.savetxt(tmp_path / "kitti.txt", T[:, :3].reshape(3, 12))
+    for name in ("slam.tum", "kitti.txt", str(tmp_path / "slam.tum")):
+        source = BagSource(f"{path}?poses={name}")
+        for k, frame in enumerate(source):
+            np.testing.assert_allclose(frame.T_world_sensor, T[k], atol=1e-6)
+    with pytest.raises(SourceError, match="no topic nowhere"):
+        BagSource(f"{path}?poses=nowhere.txt")
 
 
 def test_several_pose_topics_need_a_choice_but_depth_comes_all_the_same(tmp_path):

@@ -251,6 +251,69 @@ def test_clouds_of_a_bag(bag):
     assert [mapper.add(cloud).refused for cloud in source] == [None] * 3
 
 
+LIDARS = {"front": [1.0, 0, 0.5, 0, 0, 0, 1], "roof": [0.2, 0.1, 1.0, 1, 0, 0, 0]}
+"""Mounts of two lidars, one of them upside down: tx ty tz qx qy qz qw."""
+
+
+def write_based_bag(path, frames=("front", "roof"), static=True):
+    """Write clouds of lidars on a base of which only the odometry is known: x = time, turning at 1 rad/s."""
+    with RobotBagMaker(path) as bag:
+        for name, numbers in LIDARS.items() if static else ():
+            bag.tf(START_NS, "base_link", name, numbers, "/tf_static")
+        for k in range(-5, 40):
+            stamp = START_NS + 10 * k * MS
+            numbers = planar_numbers(0.01 * k, 0, 0.01 * k)
+            bag.add("/odom", "nav_msgs/Odometry", stamp, bag.odometry(stamp, numbers))
+        for n, name in enumerate(frames):
+            stamp = START_NS + 100 * n * MS
+            bag.add("/points", "sensor_msgs/PointCloud2", stamp, bag.cloud(stamp, POINTS[:2], name))
+    return path
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive"])
+def test_odometry_of_the_base_and_several_lidars_on_one_topic(tmp_path, name):
+    source = sv.open_source(f"{write_based_bag(tmp_path / name)}?cloud=/points")
+    world = np.array([cloud.T_world_sensor @ [1, 2, 0.5, 1] for cloud in source])
+    ahead = np.array([2.0, 2.0, 1.0])  # the first point, from the front
+    turned = [0.2 + 1.0, 0.1 - 2.0, 1.0 - 0.5]  # and from the roof, where y and z point the other way
+    c, s = np.cos(0.1), np.sin(0.1)
+    turned = [0.1 + c * turned[0] - s * turned[1], s * turned[0] + c * turned[1], turned[2]]
+    np.testing.assert_allclose(world[:, :3], [ahead, turned], atol=1e-6)
+
+
+def test_a_lidar_that_nothing_mounts_is_refused_until_the_user_does(tmp_path):
+    path = write_based_bag(tmp_path / "drive.bag", ("front", "front"), static=False)
+    cloud = sv.open_source(f"{path}?cloud=/points").frame(0)
+    assert cloud.fault == "no_pose"
+    assert "nothing in /tf connects it with the sensor's frame 'front'" in cloud.fault_detail
+    assert "?mount=x,y,z,yaw,pitch,roll" in cloud.fault_detail
+    T = sv.open_source(f"{path}?cloud=/points&mount=0.2,0.1,1,0,0,{np.pi}").frame(0).T_world_sensor
+    np.testing.assert_allclose(T @ [1, 2, 0.5, 1], [1.2, -1.9, 0.5, 1], atol=1e-6)
+    two = write_based_bag(tmp_path / "two.bag", static=False)
+    faults = [cloud.fault for cloud in sv.open_source(f"{two}?cloud=/points&mount=0,0,0")]
+    assert faults == [None, "no_pose"]  # the second is of another sensor
+
+
+def test_clouds_in_the_world_have_no_rays(tmp_path):
+    with RobotBagMaker(tmp_path / "drive.bag") as bag:
+        for k in range(40):
+            bag.tf(START_NS + 10 * k * MS, "odom", "lidar", planar_numbers(0.01 * k, 0, 0))
+        bag.add("/points", "sensor_msgs/PointCloud2", START_NS, bag.cloud(START_NS, POINTS[:2], "odom"))
+    with pytest.raises(SourceError, match="in frame 'odom', in which lidar moves, so its rays have no origin"):
+        sv.open_source(f"{bag.path}?cloud=/points")
+    path = write_based_bag(tmp_path / "based.bag", ("odom",))
+    assert "no origin" in sv.open_source(f"{path}?cloud=/points").frame(0).fault_detail
+
+
+def test_poses_of_a_slam_program_for_its_own_bag(tmp_path):
+    path, stamps = write_based_bag(tmp_path / "drive.bag", ("front",) * 3), [START_NS + 100 * n * MS for n in range(3)]
+    write_poses(tmp_path, stamps, "fast_lio.tum")
+    np.savetxt(tmp_path / "kiss.txt", np.array([pose(n) for n in range(3)])[:, :3].reshape(3, 12))
+    for name in ("fast_lio.tum", "kiss.txt"):
+        for n, cloud in enumerate(sv.open_source(f"{path}?cloud=/points&poses={name}")):
+            np.testing.assert_allclose(cloud.T_world_sensor, pose(n), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("kind", "times"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,21 @@ class DepthTopic:
         """Return the time at which image `i` was recorded."""
         return int(self._stamps[i])
 
+    def taken_ns(self) -> list[int]:
+        """Return the times of all readable images, ascending; their pixels are not decoded."""
+        found = set[int]()
+        for i in range(len(self)):
+            with suppress(FrameRefused):
+                found.add(self._time(i, read_picture(self._file, self.topic, i, self.topic))[0])
+        return sorted(found)
+
+    def _time(self, i: int, picture: Picture) -> tuple[int, dict[str, str]]:
+        """Return an image's time in nanoseconds, and its metadata."""
+        info = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
+        if "timestamp" in info:  # only in .db3, where the header counts from the start of the recording
+            return ns_from_ms(info["timestamp"]) or picture.stamp_ns, info
+        return picture.stamp_ns, info
+
     def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
         """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
 
@@ -71,11 +87,8 @@ class DepthTopic:
         picture = read_picture(self._file, self.topic, i, name)
         packed = self._file.types[self.topic] == COMPRESSED
         depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
-        stamp_ns, unit = picture.stamp_ns, picture.depth_units
-        info = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
-        if "timestamp" in info:  # only in .db3, where the header counts from the start of the recording
-            stamp_ns = ns_from_ms(info["timestamp"]) or stamp_ns
-        unit = unit or _positive(info.get("depth_units", "")) or self._unit
+        stamp_ns, info = self._time(i, picture)
+        unit = picture.depth_units or _positive(info.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
 
 

@@ -16,7 +16,7 @@ from stereovox.geometry.se3 import Transform
 from stereovox.sources.bags.depth_topic import Metadata
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import Wire, ns_from_ms
-from stereovox.sources.bags.tf import Tf
+from stereovox.sources.bags.tf import Tf, TfPoses
 from stereovox.sources.imu import ImuReadings, at_times, in_order, up_of_force
 
 IMU = "sensor_msgs/Imu"
@@ -62,8 +62,8 @@ def read_acceleration(wire: Wire) -> tuple[int, str, NDArray[np.float64]]:
     return found.stamp_ns, found.frame_id, np.array(found.force)
 
 
-def up_by_gravity(file: BagFile, tf: Tf, world: str) -> NDArray[np.float64] | None:
-    """Return the unit vector (3,) that points up in `world`.
+def up_by_gravity(file: BagFile, poses: TfPoses) -> NDArray[np.float64] | None:
+    """Return the unit vector (3,) that points up in the world of `poses`.
 
     None if no IMU's frame is connected with it by /tf, or the mean acceleration is not gravity.
     """
@@ -73,7 +73,7 @@ def up_by_gravity(file: BagFile, tf: Tf, world: str) -> NDArray[np.float64] | No
         for i in np.unique(np.linspace(0, count - 1, min(SAMPLES, count)).astype(int)).tolist():
             try:
                 stamp_ns, frame_id, acceleration = read_acceleration(file.read(topic, i))
-                found.append(tf.lookup(world, frame_id, stamp_ns)[:3, :3] @ acceleration)
+                found.append(poses.of(frame_id).at(stamp_ns)[:3, :3] @ acceleration)
             except (FrameRefused, ValueError):
                 continue
         if len(found) >= MIN_SAMPLES:

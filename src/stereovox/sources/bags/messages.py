@@ -146,14 +146,15 @@ class StampedPose:
     numbers: tuple[float, ...]
     stamp_ns: int | None = None
     child: str = ""
+    parent: str = ""
 
 
 def read_pose(wire: Wire, kind: str) -> StampedPose:
     """Return the pose in a message of one of the `POSE_TYPES`, without covariance and speed."""
     name = kind.rpartition("/")[2]
-    stamp_ns = wire.header()[0] if name in STAMPED else None
+    stamp_ns, parent = wire.header() if name in STAMPED else (None, "")
     child = wire.text() if name in WITH_CHILD else ""
-    return StampedPose(wire.numbers("d", 7), stamp_ns, child)
+    return StampedPose(wire.numbers("d", 7), stamp_ns, child, parent)
 
 
 def read_pairs(wire: Wire, kind: str) -> dict[str, str]:

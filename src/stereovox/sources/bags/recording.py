@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from stereovox.sources.base import DepthSource
 from stereovox.sources.imu import ImuReadings
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES, WORLDS, turned
+from stereovox.sources.rigs.rig_options import poses_of_images
 
 STANDING = ("", "fixed")
 OptionsT = TypeVar("OptionsT")
@@ -37,7 +38,7 @@ class Options:
     """Options after the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
 
     depth, info, poses: topics of the depth images, of their `sensor_msgs/CameraInfo`, and of the camera's poses, if
-        they are not found or the wrong ones are.
+        they are not found or the wrong ones are; `poses` may also be a file of poses, of any form.
     axes: axes of the posed body, `optical`, `ros` (x forward, z up) or `opengl` (T265); world: axes of the map, `file`,
         `up` or `optical`. Defaults: `opengl` and `up` for T265 poses, else `optical` and `file`.
     world_frame: the frame of /tf that is the world; default: `map`, else `odom`, else the root of the tree.
@@ -109,7 +110,9 @@ class Bag(DepthSource):
         self._standing, self.posed = options.pose == "fixed" or not posed, posed
         self._poses, self._missing, notes = None, "", ()
         if not self._standing:
-            self._poses, self._missing, notes = read_poses(self._file, options, self._depth.frame_id)
+            self._poses, self._missing, notes = read_poses(
+                self._file, options, PosedSensor(self._depth.frame_id, stamps_ns=self._depth.taken_ns)
+            )
         self.notes = (*self._file.notes, *self._depth.notes, *notes)
 
     @classmethod
@@ -140,7 +143,7 @@ class Bag(DepthSource):
         found = self._poses
         if not isinstance(found, TurnedTf) or found.world != "file":
             return None
-        return up_by_gravity(self._file, found.poses.tf, found.poses.world)
+        return up_by_gravity(self._file, found.poses)
 
     def imu(self) -> ImuReadings | None:
         """Return the readings of the IMU in the recording; see `read_readings`."""
@@ -227,9 +230,28 @@ class TurnedTf:
         return turned(self.poses.at(stamp_ns), self.axes, self.world)
 
 
-def read_poses(file: Any, options: Options, frame_id: str) -> tuple[Poses | TurnedTf | None, str, tuple[str, ...]]:
-    """Return the poses in a bag, if any, the reason if there are none, and notes about assumptions."""
-    found = find_poses(file, options.poses, frame_id, options.world_frame)
+class PosedSensor(NamedTuple):
+    """What needs poses: the frame of a sensor ("" if unknown), the option that says how its body's poses are to be
+    read ("" if given), and its messages' times, ascending."""
+
+    frame_id: str = ""
+    option: str = "axes=ros if both have one origin"
+    stamps_ns: Callable[[], Sequence[int]] = list
+
+
+def read_poses(
+    file: Any, options: Options, sensor: PosedSensor
+) -> tuple[Poses | TurnedTf | None, str, tuple[str, ...]]:
+    """Return the poses in a bag or in a file next to it, if any, the reason if there are none, and notes about
+    assumptions."""
+    if options.poses not in file.types and (path := _file_of(options.poses, file.path)):
+        poses, axes = poses_of_images(path, sensor.stamps_ns()), options.axes or "optical"
+        T = turned(poses.T_world_body, axes, options.world or "file")
+        return Poses(poses.stamps_ns, T, where=poses.where, faults=poses.faults), "", ()
+    chained = bool(sensor.option) and not options.axes
+    found = find_poses(file, options.poses, sensor.frame_id, options.world_frame, chained)
+    if found.unmounted:
+        return None, f"{found.unmounted}; record /tf_static, or add ?{sensor.option}", ()
     if found.poses is None:
         return None, found.missing, ()
     axes = options.axes or ("opengl" if found.tracker else "optical")
@@ -242,6 +264,14 @@ def read_poses(file: Any, options: Options, frame_id: str) -> tuple[Poses | Turn
     return Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults), "", notes
 
 
+def _file_of(text: str, bag: Path) -> Path | None:
+    """Return the file of poses that an option names, None if there is no such file."""
+    try:
+        return parameters.file_of(text, bag if bag.is_dir() else bag.parent) if text else None
+    except (SourceError, OSError, ValueError):
+        return None
+
+
 def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
     """Return the poses in a `.bag` or `.db3`, for a camera pair; `where` may name the topic: `t265.bag?poses=/topic`.
 
@@ -250,7 +280,7 @@ def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
     """
     path, options = parse(str(where))
     options = replace(options, pose="", world_frame="", axes=axes or options.axes, world=world or options.world)
-    poses, missing, _ = read_poses(open_bag(path), options, "")
+    poses, missing, _ = read_poses(open_bag(path), options, PosedSensor())
     if not isinstance(poses, Poses):
         raise SourceError(missing)
     return poses

@@ -67,6 +67,14 @@ class ScanTopic:
         """Return the time at which scan `i` was recorded."""
         return int(self._stamps[i])
 
+    def taken_ns(self) -> list[int]:
+        """Return the times of all readable scans, ascending."""
+        found = set[int]()
+        for i in range(len(self)):
+            with suppress(FrameRefused, ValueError):
+                found.add(self._file.read(self.topic, i).header()[0] or self.recorded_ns(i))
+        return sorted(found)
+
     def read(self, i: int) -> LaserScan | PointCloud:
         """Return scan `i`, with the time of recording if it has none; raises FrameRefused `unreadable`."""
         wire = self._file.read(self.topic, i)

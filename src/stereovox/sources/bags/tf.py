@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,11 +309,15 @@ def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
 
 @dataclass(frozen=True)
 class TfPoses:
-    """Poses of frame `body` in frame `world`, looked up on demand."""
+    """Poses of frame `body` in frame `world`, looked up on demand.
+
+    edge: poses of a frame of the tree in `world`, which is then not in the tree (odometry); None: all is in the tree.
+    """
 
     tf: Tf
     world: str
     body: str
+    edge: Edge | None = None
 
     @property
     def where(self) -> str:
@@ -322,11 +326,20 @@ class TfPoses:
 
     def at(self, stamp_ns: int) -> Transform:
         """Return T_world_body at a time; raises FrameRefused `no_pose` (see `Tf.lookup`)."""
-        return self.tf.lookup(self.world, self.body, stamp_ns)
+        if self.edge is None:
+            return self.tf.lookup(self.world, self.body, stamp_ns)
+        T_world_child = self.edge.at(int(stamp_ns), self.tf.limits, self.tf.where)
+        return T_world_child @ self.tf.lookup(self.edge.child, self.body, stamp_ns)
+
+    def of(self, frame: str) -> TfPoses:
+        """Return the poses of another frame in the same world."""
+        return replace(self, body=frame_name(frame))
 
     def off_ns(self, stamp_ns: int) -> int:
         """Return how far the pose at a time is extrapolated."""
-        return self.tf.off_ns(self.world, self.body, stamp_ns)
+        if self.edge is None:
+            return self.tf.off_ns(self.world, self.body, stamp_ns)
+        return max(self.edge.off_ns(int(stamp_ns)), self.tf.off_ns(self.edge.child, self.body, stamp_ns))
 
 
 def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:

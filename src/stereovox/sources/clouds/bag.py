@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -15,12 +16,14 @@ from stereovox.frame import Cloud
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
-from stereovox.sources.bags.recording import TurnedTf, file_part, read_poses
+from stereovox.sources.bags.recording import PosedSensor, TurnedTf, file_part, read_poses
 from stereovox.sources.bags.robot_messages import LASER_SCAN, POINT_CLOUD, LaserScan, PointCloud
 from stereovox.sources.bags.scans import ScanTopic, check_topic
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
+from stereovox.sources.parameters import mounted
 
 TOPICS = {"cloud": POINT_CLOUD, "scan": LASER_SCAN}
+MOUNT = "mount=x,y,z,yaw,pitch,roll of the lidar on it"
 
 
 @dataclass(frozen=True)
@@ -28,15 +31,21 @@ class Options(LidarOptions):
     """Those of all clouds (`LidarOptions`), and:
 
     cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) to use
-    instead. poses: topic of the lidar's poses; default: /tf. world_frame: as for depth images. deskew: 0
-    to treat the points of a cloud as measured at once although they have times.
+    instead. poses: topic or file of the lidar's poses, or of its body's; default: /tf. mount: where the lidar is on the
+    posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians (0,0,0: the poses are the lidar's).
+    world_frame: as for depth images. deskew: 0 to treat the points of a cloud as measured at once although they have
+    times.
     """
 
     cloud: str = ""
     scan: str = ""
     poses: str = ""
+    mount: str = ""
     world_frame: str = ""
     deskew: bool = True
+
+    def __post_init__(self) -> None:
+        mounted("mount", self.mount)
 
 
 class BagClouds(CloudSource):
@@ -65,8 +74,12 @@ class BagClouds(CloudSource):
         check_topic(self._file, topic, (TOPICS[key],), key)
         self._scans = ScanTopic(self._file, topic, self._options.range_max)
         self.name, self.lidar = f"{Path(path).name} {topic}", self._options.lidar
-        options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame, axes="optical")
-        self._poses, self._missing, notes = read_poses(self._file, options, self._scans.frame_id)
+        mount = mounted("mount", self._options.mount)
+        self._T_body_lidar = np.eye(4) if mount is None else mount
+        options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame)
+        sensor = PosedSensor(self._scans.frame_id, "" if self._options.mount else MOUNT, self._scans.taken_ns)
+        self._poses, self._missing, notes = read_poses(self._file, options, sensor)
+        self._refuse_world()
         self.notes = (*self._file.notes, *notes, *self._note_of_times(), *self._scans.notes)
         self.posed = self._poses is not None
 
@@ -91,25 +104,49 @@ class BagClouds(CloudSource):
     def cloud(self, i: int) -> Cloud:
         """Return cloud `i`, deskewed if its points have times."""
         message = self._scans.read(i)
-        T = self._pose_at(message.stamp_ns)
+        pose_at = partial(self._pose_at, message.frame_id)
+        T = pose_at(message.stamp_ns)
         if isinstance(message, LaserScan):
             found = cloud_of_scan(message, self._options)
         else:
             found = Cloud(message.points, T, lidar=self.lidar)
         found = replace(
             found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic,
-            pose_off_ns=self._off_ns(message.stamp_ns),
+            pose_off_ns=self._off_ns(message.frame_id, message.stamp_ns),
         )  # fmt: skip
         times = message.times_s if isinstance(message, PointCloud) and self._options.deskew else None
-        return found if times is None else deskewed(found, times, self._pose_at)
+        return found if times is None else deskewed(found, times, pose_at)
 
-    def _pose_at(self, stamp_ns: int) -> np.ndarray:
-        if self._poses is None:
+    def _pose_at(self, frame_id: str, stamp_ns: int) -> np.ndarray:
+        """Return the pose of a sensor that publishes on the topic; a topic may carry those of several sensors."""
+        found = self._poses
+        if found is None:
             raise FrameRefused("no_pose", self._missing)
-        return self._poses.at(stamp_ns)
+        if isinstance(found, TurnedTf) and not self._options.mount:
+            return replace(found, poses=found.poses.of(frame_id)).at(stamp_ns)
+        if frame_id != self._scans.frame_id:
+            said = f"this cloud is in frame '{frame_id}', the poses are those of '{self._scans.frame_id}'"
+            raise FrameRefused("no_pose", f"{self._scans.topic}: {said}; record /tf_static, or leave it out")
+        return found.at(stamp_ns) @ self._T_body_lidar
 
-    def _off_ns(self, stamp_ns: int) -> int:
-        return self._poses.poses.off_ns(stamp_ns) if isinstance(self._poses, TurnedTf) else 0
+    def _off_ns(self, frame_id: str, stamp_ns: int) -> int:
+        if not isinstance(self._poses, TurnedTf):
+            return 0
+        return self._poses.poses.of(frame_id).off_ns(stamp_ns)
+
+    def _refuse_world(self) -> None:
+        """Raise SourceError for clouds in the world's own frame although robots move in it: nobody knows where their
+        rays began.
+        """
+        if not isinstance(self._poses, TurnedTf):
+            return
+        tf, world, body = self._poses.poses.tf, self._poses.poses.world, self._scans.frame_id
+        if self._poses.poses.edge is not None or tf.moving(world, body):
+            return
+        moving = next((name for name in tf.frames if tf.connected(world, name) and tf.moving(world, name)), None)
+        if moving:
+            said = f"{self._scans.topic} is in frame '{body}', in which {moving} moves, so its rays have no origin"
+            raise SourceError(f"{self._file.path}: {said}; name the lidar's own topic")
 
     def _note_of_times(self) -> tuple[str, ...]:
         """Return a note if clouds are assumed to be measured at once."""

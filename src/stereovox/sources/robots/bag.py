@@ -11,7 +11,7 @@ import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame, Scan
-from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, depth_topics, find_depth
 from stereovox.sources.bags.files import BagFile
@@ -21,6 +21,7 @@ from stereovox.sources.bags.robot_messages import LaserScan, frame_name
 from stereovox.sources.bags.scans import busiest_topic, find_scans
 from stereovox.sources.bags.tf import Limits
 from stereovox.sources.base import Lazy
+from stereovox.sources.parameters import mounted
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
@@ -75,23 +76,6 @@ class RobotOptions:
             raise SourceError(f"lowest={self.lowest:g} must be below highest={self.highest:g}")
         for key in ("mount", "camera_mount"):
             mounted(key, getattr(self, key))
-
-
-def mounted(key: str, text: str) -> Transform | None:
-    """Parse `x,y,z,yaw,pitch,roll` as T_base_body, None for ""; raises SourceError for anything else."""
-    if not text:
-        return None
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if not (3 <= len(numbers) <= 6 and np.isfinite(numbers).all()):
-        raise SourceError(f"{key}={text} must be x,y,z,yaw in metres and radians; pitch and roll may follow")
-    yaw, pitch, roll = (*numbers[3:], 0.0, 0.0, 0.0)[:3]
-    T = np.eye(4)
-    T[:3, :3] = rotation_matrix([0, 0, yaw]) @ rotation_matrix([0, pitch, 0]) @ rotation_matrix([roll, 0, 0])
-    T[:3, 3] = numbers[:3]
-    return T
 
 
 class RobotBag:

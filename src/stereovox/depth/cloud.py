@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +26,13 @@ STEPS, STEP_S = 64, 0.002
 """Poses of a moving sensor during one cloud, and most seconds between two: it moves a few centimetres in that time."""
 LONGEST_S, FARTHEST_S = 10.0, 1e6
 """Most seconds from the first to the last point of a cloud, and from its stamp; larger numbers are not times."""
+TIME_UNITS = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+SWEEP_S, OF_PERIOD = (1.5e-3, 1.5), (0.1, 2.5)
+"""Shortest and longest sweep: in seconds if nothing else is known, else in periods of the clouds. The ratio of each
+pair is at most 1000, so that at most one unit fits."""
+USUAL_PERIOD_S, SAME_CLOCK_S = 0.5, 5.0
+"""Longest period that sweeps fill (longer ones are of clouds that were left out), and largest distance of times from
+the stamp of their cloud on one clock."""
 
 
 def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
@@ -75,6 +83,63 @@ def _check_unit(
         arms = ends[some] if starts is None else ends[some] - starts[some]
         with np.errstate(over="ignore", invalid="ignore"):
             check_unit_of_rays(cloud, np.sqrt(np.einsum("ij,ij->i", arms, arms)), config)
+
+
+class SweepTimes(NamedTuple):
+    """When the points of a cloud were measured.
+
+    seconds: (N,) float64 from the stamp of the cloud, NaN: unknown; None: at once. words: how they were read, if that
+    is unusual.
+    """
+
+    seconds: NDArray[np.float64] | None
+    words: str = ""
+
+
+def sweep_times(
+    given: NDArray[np.generic], used: NDArray[np.bool_], stamp_ns: int, period_s: float = 0.0
+) -> SweepTimes:
+    """Return times of points, whose unit and origin drivers choose freely, in seconds from the stamp of their cloud.
+
+    The unit is the one in which the sweep takes a plausible time. Times near zero count from the stamp, those near the
+    stamp are on its clock, and all others are on another clock, on which the stamp is the first point.
+
+    Args:
+        given: (N,) numbers of a point field.
+        used: (N,) whether a point is one; invalid ones often have a time of 0.
+        stamp_ns: Stamp of the cloud.
+        period_s: Time from cloud to cloud, 0 if unknown.
+
+    Raises:
+        ValueError: There is no such unit.
+    """
+    times = given.astype(np.float64)
+    known = used & np.isfinite(times)
+    some = times[known & (times != 0)]
+    if some.size and some.min() > 10 * np.ptp(some) > 0:
+        known &= times != 0
+    times = np.where(known, times, np.nan)
+    if not known.any():
+        return SweepTimes(times)
+    first, span = float(np.nanmin(times)), float(np.nanmax(times) - np.nanmin(times))
+    low, high = SWEEP_S if not 0 < period_s <= USUAL_PERIOD_S else (period_s * share for share in OF_PERIOD)
+    unit = next((unit for unit in TIME_UNITS if low <= span * unit <= high), 0.0)
+    coarse = given.dtype == np.float32 and float(np.spacing(np.float32(first + span))) > 0.05 * span
+    if coarse and first > 0:
+        return SweepTimes(None, "too coarse to say anything, and ignored")
+    if not unit and not span and abs(first) <= high:
+        return SweepTimes(times)
+    if not unit and period_s and 0 <= first <= first + span <= 1:
+        return SweepTimes(times * period_s, f"shares of the {period_s:.3g} s from cloud to cloud")
+    if not unit:
+        raise ValueError(f"times of its points span {span:g}, in no unit between {low:.3g} and {high:.3g} s")
+    words = "" if unit == (1e-9 if given.dtype.kind in "iu" else 1.0) else f"in {TIME_UNITS[unit]}"
+    if abs(first * unit) <= 2 * high:
+        return SweepTimes(times * unit, words)
+    since = (times - 1e-9 * stamp_ns / unit) * unit
+    if abs(float(np.nanmedian(since))) <= SAME_CLOCK_S:
+        return SweepTimes(since, words)
+    return SweepTimes((times - first) * unit, f"in {TIME_UNITS[unit]} of another clock, from the first point on")
 
 
 def deskewed(cloud: Cloud, times_s: ArrayLike, pose_at: Callable[[int], Transform]) -> Cloud:

@@ -4,11 +4,13 @@
 import made_kitti
 import numpy as np
 import pytest
-from made_robot_bags import MS, START_NS, RobotBagMaker, planar_motion, planar_numbers
+from made_robot_bags import MS, START_NS, Messages, RobotBagMaker, planar_motion, planar_numbers
 
 import stereovox as sv
 from stereovox.cli import main
+from stereovox.depth.cloud import sweep_times
 from stereovox.errors import NoPoses, SourceError
+from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import read_point_cloud
 from stereovox.sources.poses.trajectory import write_trajectory
 
@@ -321,9 +323,18 @@ def test_poses_of_a_slam_program_for_its_own_bag(tmp_path):
         (6, [0, 50_000_000, 0]),
         (8, lambda stamp: 1e-9 * stamp + np.array([0.0, 0.05, 0.0])),
         (8, lambda stamp: stamp + np.array([0.0, 5e7, 0.0])),
+        (7, [0.0, 5e4, 0.0]),
+        (6, [0, 50_000, 0]),
+        (7, [0.0, 50.0, 0.0]),
+        (8, lambda stamp: 1e-3 * stamp + np.array([0.0, 5e4, 0.0])),
+        (8, lambda stamp: 1e-9 * stamp + np.array([0.0, 0.05, -1e-9 * stamp])),
+        (6, [3_000_000_000, 3_050_000_000, 0]),
+        (8, [777.0, 777.05, 0.0]),
+        (7, [0.0, 0.5, 1.0]),
     ],
-    ids=["seconds", "nanoseconds", "clock", "clock in nanoseconds"],
-)
+    ids=["seconds", "nanoseconds", "clock", "clock in nanoseconds", "float us", "whole us", "ms", "clock in us",
+         "no time for no point", "another clock", "seconds of another clock", "share of the sweep"],
+)  # fmt: skip
 def test_points_with_times_are_straightened(tmp_path, kind, times):
     path = write_bag(tmp_path / "drive.bag", times, kind)
     cloud = sv.open_source(f"{path}?cloud=/points").frame(0)
@@ -382,8 +393,6 @@ def test_a_cloud_whose_time_no_pose_covers_has_a_fault(tmp_path):
 
 
 def test_fields_of_times_that_do_not_fit_are_left_out():
-    from made_robot_bags import Messages
-
     messages = Messages(1)
     cloud = messages.cloud(
         5,
@@ -391,3 +400,48 @@ def test_fields_of_times_that_do_not_fit_are_left_out():
         fields=[*(messages.field(n, 4 * k, 7) for k, n in enumerate("xyz")), messages.field("t", 10, 8)],
     )
     assert read_point_cloud(messages.wire("sensor_msgs/PointCloud2", cloud)).times_s is None
+
+
+def test_a_clock_in_float32_says_nothing():
+    """Its steps at today's dates are 128 s, so its points would be taken from far along the drive."""
+    stamp, points = 1_700_000_000_000_000_000, np.ones(3, bool)
+    for times in (np.full(3, 1.7e9, "f4"), np.array([1.7e9, 1.7e9 + 128, 1.7e9], "f4")):
+        found = sweep_times(times, points, stamp, 0.1)
+        assert found.seconds is None
+        assert "too coarse" in found.words
+
+
+def test_times_that_fit_no_sweep_refuse_the_cloud(tmp_path):
+    path = write_bag(tmp_path / "drive.bag", [0.0, 5.0, 0.0])
+    detail = sv.open_source(f"{path}?cloud=/points").frame(0).fault_detail
+    assert "span 5, in no unit between 0.01 and 0.25 s; add ?deskew=0" in detail
+    assert sv.open_source(f"{path}?cloud=/points&deskew=0").frame(0).fault is None
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_clouds_of_the_first_version_and_of_livox(tmp_path, ros):
+    """By their definitions: PointCloud.msg, and CustomMsg.msg of livox_ros_driver2, whose points have 19 bytes."""
+    messages, points = Messages(ros), POINTS[:2]
+    head = messages.raw("std_msgs/Header", messages.header(START_NS, "lidar"))
+    head += bytes(-(len(head) - 4) % 4) if ros == 2 else b""
+    name = b"t\0\0\0" if ros == 2 else b"t"
+    channels = np.uint32([1, 2 if ros == 2 else 1]).tobytes() + name
+    first = head + np.uint32(2).tobytes() + points.tobytes() + channels + np.uint32(2).tobytes()
+    first += np.float32([0, 0.05]).tobytes()
+    base = bytes(-(len(head) - 4) % 8) if ros == 2 else b""
+    livox = head + base + np.uint64(START_NS + 10**6).tobytes() + np.uint32(2).tobytes() + bytes([3, 0, 0, 0])
+    livox += np.uint32(2).tobytes()
+    for n, point in enumerate(points):
+        livox += np.uint32(n * 50_000_000).tobytes() + point.tobytes() + bytes([9, 8, 7])
+        livox += b"\0" if ros == 2 and n == 0 else b""
+    for kind, data, times in (
+        ("sensor_msgs/PointCloud", first, [0, 0.05]),
+        ("livox_ros_driver2/CustomMsg", livox, [0.001, 0.051]),
+    ):
+        cloud = read_point_cloud(Wire(data, cdr=ros == 2), kind, 0.1)
+        assert (cloud.stamp_ns, cloud.frame_id, cloud.fault) == (START_NS, "lidar", "")
+        np.testing.assert_array_equal(cloud.points, points)
+        np.testing.assert_allclose(cloud.times_s, times, atol=1e-8)
+        for length in range(0, len(data), 3):
+            with pytest.raises(ValueError, match=r"bytes are announced|numbers"):
+                read_point_cloud(Wire(data[:length], cdr=ros == 2), kind, 0.1)

@@ -24,6 +24,7 @@ from stereovox.sources.bags.messages import (
     read_pairs,
     read_value,
 )
+from stereovox.sources.bags.robot_messages import CLOUDS
 
 PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 VALUES = ("std_msgs/Float32", "std_msgs/String")
@@ -107,7 +108,7 @@ def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
         raise SourceError(f"{file.path}: several topics with depth, choose one: ?depth={' or ?depth='.join(found)}")
     if not found:
         seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
-        clouds = [f"?cloud={name}" for name, kind in sorted(file.types.items()) if kind == "sensor_msgs/PointCloud2"]
+        clouds = [f"?cloud={name}" for name, kind in sorted(file.types.items()) if kind in CLOUDS]
         cure = f"; for its clouds add {' or '.join(clouds)}" if clouds else ""
         raise SourceError(f"{file.path}: no depth images ({', '.join(DEPTH)} or {PACKED}) in it; it holds {seen}{cure}")
     return DepthTopic(file, found[0], info)

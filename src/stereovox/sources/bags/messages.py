@@ -32,9 +32,9 @@ class Wire:
 
     def __init__(self, data: bytes | memoryview, cdr: bool):
         self._view, self._cdr, self._at, self._start = memoryview(data), cdr, 0, 0
-        self._order: Literal["<", ">"] = "<"
+        self.order: Literal["<", ">"] = "<"
         if cdr:
-            self._order = "<" if bytes(self.block(4))[1:2] == b"\1" else ">"
+            self.order = "<" if bytes(self.block(4))[1:2] == b"\1" else ">"
             self._start = 4
 
     @property
@@ -47,7 +47,7 @@ class Wire:
         size = struct.calcsize(code)
         if self._cdr:
             self._at += -(self._at - self._start) % size
-        return struct.unpack(f"{self._order}{count}{code}", self.block(size * count))
+        return struct.unpack(f"{self.order}{count}{code}", self.block(size * count))
 
     def number(self, code: str = "I") -> Any:
         """Return one number of the struct type `code`."""
@@ -58,8 +58,14 @@ class Wire:
         dtype = np.dtype(code)
         if self._cdr and count:  # aligned only if something follows
             self._at += -(self._at - self._start) % dtype.itemsize
-        stored = np.frombuffer(self.block(dtype.itemsize * count), dtype.newbyteorder(self._order))
+        stored = np.frombuffer(self.block(dtype.itemsize * count), dtype.newbyteorder(self.order))
         return stored.astype(dtype)
+
+    def point_size(self, size: int) -> int:
+        """Return the distance of records of `size` bytes that begin with a number of four, and go to the first."""
+        if self._cdr:
+            self._at += -(self._at - self._start) % 4
+        return size + (-size % 4 if self._cdr else 0)
 
     def block(self, size: int) -> memoryview:
         """Return the next `size` bytes without a copy."""

@@ -8,26 +8,30 @@ values; no allocation trusts a declared length.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import atan2, hypot, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.depth.cloud import sweep_times
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.sources.bags.messages import Wire
 
 OCCUPANCY_GRID, OCTOMAP = "nav_msgs/OccupancyGrid", "octomap_msgs/Octomap"
 LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
+LIVOX = tuple(f"{package}/CustomMsg" for package in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
+CLOUDS = (POINT_CLOUD, "sensor_msgs/PointCloud", *LIVOX)
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 FLOATS = {7: "f4", 8: "f8"}
 """`sensor_msgs/PointField` types that can hold a coordinate."""
 NUMBERS = {5: "i4", 6: "u4", **FLOATS}
-POINT_TIMES = ("time", "t", "timestamp", "offset_time", "time_stamp")
-"""Fields with the time of each point: Velodyne's, Ouster's, Hesai's, Livox's, and others'."""
-CLOCK_FROM, NANOSECONDS_FROM = 1e6, 1e15
-"""Numbers above which a time is a clock's, in seconds and in nanoseconds."""
+POINT_TIMES = (
+    "time", "t", "timestamp", "offset_time", "time_stamp", "time_offset", "time_offset_ns", "timestamp_ns", "time_us",
+    "t_us", "point_time", "point_time_offset", "relative_time", "rel_time", "ts", "stamp", "timestamps",
+)  # fmt: skip
+"""Fields with the time of each point: Velodyne's, Ouster's, Hesai's, Livox's, Aeva's, and others'."""
 MAX_FIELDS = 256
 MAX_BEAMS = 100_000
 LARGEST = 1e9
@@ -86,23 +90,34 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point.
+    """The points of a cloud message: (N, 3) float32 metres in frame `frame_id`; NaN: no point.
 
     times_s: (N,) float64 seconds from `stamp_ns` at which each was measured; None if the cloud has no times.
+    times: how they were read, if that is unusual (`sweep_times`). fault: why they cannot be read, "" if they can.
     """
 
     stamp_ns: int
     frame_id: str
     points: NDArray[np.float32]
     times_s: NDArray[np.float64] | None = None
+    times: str = ""
+    fault: str = ""
 
 
-def read_point_cloud(wire: Wire) -> PointCloud:
-    """Return a `sensor_msgs/PointCloud2`: its fields x, y and z, at any offset, as 4 or 8 byte floats.
+def read_point_cloud(wire: Wire, kind: str = POINT_CLOUD, period_s: float = 0.0) -> PointCloud:
+    """Return the points of a message of one of the `CLOUDS`; period_s: time from message to message, 0 if unknown.
 
-    Times of points: the first existing field of `POINT_TIMES`.
+    `PointCloud2`: fields x, y and z, at any offset, as 4 or 8 byte floats; times are the first existing field of
+    `POINT_TIMES`, of a `PointCloud` such a channel, and Livox's `CustomMsg` has them in nanoseconds.
     Raises ValueError for a cloud without them, with too little data, or with overlapping points.
     """
+    if kind.endswith("/CustomMsg"):
+        return _livox(wire)
+    return _point_cloud(wire, period_s) if kind == POINT_CLOUD else _point_cloud_1(wire, period_s)
+
+
+def _point_cloud(wire: Wire, period_s: float) -> PointCloud:
+    """Return a `sensor_msgs/PointCloud2`."""
     stamp_ns, frame_id = wire.header()
     height, width = wire.numbers("I", 2)
     fields = _fields(wire)
@@ -131,28 +146,53 @@ def read_point_cloud(wire: Wire) -> PointCloud:
         return np.ndarray((height, width), dtype, data, offset, (row_step, point_step)).ravel()
 
     columns = [column(dtype, offset) for dtype, offset in zip(types, offsets, strict=True)]
-    times = None
+    with np.errstate(over="ignore", invalid="ignore"):
+        cloud = PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32))
     for name in POINT_TIMES:
         offset, kind = fields.get(name, (0, 0))
         dtype = np.dtype(f"{order}{NUMBERS[kind]}") if kind in NUMBERS else None
         if dtype is not None and offset + dtype.itemsize <= point_step:
-            times = _seconds(column(dtype, offset), stamp_ns)
-            break
-    with np.errstate(over="ignore", invalid="ignore"):
-        return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32), times)
+            return _timed(cloud, column(dtype, offset), period_s)
+    return cloud
 
 
-def _seconds(given: NDArray[np.generic], stamp_ns: int) -> NDArray[np.float64]:
-    """Return times of points in seconds from their cloud's stamp: integers are nanoseconds, others seconds; large
-    numbers are clock times and not offsets within the sweep.
-    """
-    if given.dtype.kind in "iu":
-        return 1e-9 * given.astype(np.float64)
-    times = given.astype(np.float64)
-    largest = float(np.abs(times[np.isfinite(times)]).max(initial=0.0))
-    if largest > NANOSECONDS_FROM:  # nanoseconds since 1970
-        return 1e-9 * (times - stamp_ns)
-    return times - 1e-9 * stamp_ns if largest > CLOCK_FROM else times
+def _point_cloud_1(wire: Wire, period_s: float) -> PointCloud:
+    """Return a `sensor_msgs/PointCloud`, the first version: points, then channels of a float for each."""
+    stamp_ns, frame_id = wire.header()
+    count = wire.number()
+    cloud = PointCloud(stamp_ns, frame_id, wire.array("f4", 3 * count).astype(np.float32).reshape(-1, 3))
+    channels = dict[str, NDArray[np.generic]]()
+    for _ in range(min(wire.number(), MAX_FIELDS)):
+        name = wire.text()
+        channels.setdefault(name, wire.array("f4", wire.number()))
+    times = next((channels[name] for name in POINT_TIMES if len(channels.get(name, ())) == count), None)
+    return cloud if times is None else _timed(cloud, times, period_s)
+
+
+def _livox(wire: Wire) -> PointCloud:
+    """Return a `CustomMsg` of Livox's drivers: points of 19 bytes, in ROS 2 aligned to 20."""
+    stamp_ns, frame_id = wire.header()
+    base_ns, count, _ = wire.number("Q"), wire.number(), wire.numbers("B", 4)
+    if wire.number() != count:
+        raise ValueError("a cloud with two different numbers of points")
+    if not count:
+        return PointCloud(stamp_ns, frame_id, np.empty((0, 3), np.float32))
+    record = np.dtype([("t", "u4"), ("p", "f4", 3), ("rest", "u1", 3)]).newbyteorder(wire.order)
+    size = wire.point_size(record.itemsize)
+    data = wire.block(size * (count - 1) + record.itemsize)
+    points = np.ndarray(count, record, data, strides=(size,))
+    offset_s = 1e-9 * (base_ns - stamp_ns) if abs(base_ns - stamp_ns) < 10**9 else 0.0  # or it has another clock
+    return PointCloud(stamp_ns, frame_id, points["p"].astype(np.float32), 1e-9 * points["t"].astype(float) + offset_s)
+
+
+def _timed(cloud: PointCloud, given: NDArray[np.generic], period_s: float) -> PointCloud:
+    """Return a cloud with times of its points, or the reason why they cannot be read."""
+    used = np.isfinite(cloud.points).all(axis=1) & cloud.points.any(axis=1)
+    try:
+        found = sweep_times(given.astype(given.dtype.newbyteorder("=")), used, cloud.stamp_ns, period_s)
+    except ValueError as error:
+        return replace(cloud, fault=str(error))
+    return replace(cloud, times_s=found.seconds, times=found.words)
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
+
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.robot_messages import (
+    CLOUDS,
     LASER_SCAN,
     ODOMETRY,
-    POINT_CLOUD,
     LaserScan,
     PointCloud,
     StampedTransform,
@@ -37,9 +39,10 @@ class ScanTopic:
     """
 
     def __init__(self, file: BagFile, topic: str, range_max: float = 0.0):
-        self.path, self.topic, self.is_cloud = file.path, topic, file.types[topic] == POINT_CLOUD
+        self.path, self.topic, self.is_cloud = file.path, topic, file.types[topic] in CLOUDS
         self._file, self._range_max = file, range_max
-        self._stamps = file.stamps(topic)
+        self._stamps, self._kind = file.stamps(topic), file.types[topic]
+        self._period_s = float(np.median(np.diff(self._stamps))) * 1e-9 if len(self._stamps) > 1 else 0.0
         self.frame_id = frame_id_of(file, topic)
 
     def __len__(self) -> int:
@@ -79,7 +82,10 @@ class ScanTopic:
         """Return scan `i`, with the time of recording if it has none; raises FrameRefused `unreadable`."""
         wire = self._file.read(self.topic, i)
         try:
-            message = read_point_cloud(wire) if self.is_cloud else read_laser_scan(wire, self._range_max)
+            if self.is_cloud:
+                message = read_point_cloud(wire, self._kind, self._period_s)
+            else:
+                message = read_laser_scan(wire, self._range_max)
         except ValueError as error:
             raise FrameRefused("unreadable", f"{self.name(i)}: {error}; leave it out") from None
         return replace(message, stamp_ns=message.stamp_ns or self.recorded_ns(i), frame_id=frame_name(message.frame_id))
@@ -94,11 +100,11 @@ def find_scans(
     Raises SourceError if the named topic does not exist or has no scans.
     """
     if topic:
-        check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
+        check_topic(file, topic, (LASER_SCAN, *CLOUDS), "scan")
         return ScanTopic(file, topic, range_max), ()
     found = _topics_of_type(file, LASER_SCAN)
     if not found:
-        clouds = _topics_of_type(file, POINT_CLOUD)
+        clouds = _topics_of_type(file, *CLOUDS)
         found = [name for name in clouds if not depth_frame or frame_id_of(file, name) != frame_name(depth_frame)]
     if not found:
         return None, ()
@@ -179,5 +185,5 @@ def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
     return edge
 
 
-def _topics_of_type(file: BagFile, kind: str) -> list[str]:
-    return sorted(topic for topic, known in file.types.items() if known == kind)
+def _topics_of_type(file: BagFile, *kinds: str) -> list[str]:
+    return sorted(topic for topic, known in file.types.items() if known in kinds)

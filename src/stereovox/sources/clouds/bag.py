@@ -17,12 +17,12 @@ from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
 from stereovox.sources.bags.recording import PosedSensor, TurnedTf, file_part, read_poses
-from stereovox.sources.bags.robot_messages import LASER_SCAN, POINT_CLOUD, LaserScan, PointCloud
+from stereovox.sources.bags.robot_messages import CLOUDS, LASER_SCAN, LaserScan, PointCloud
 from stereovox.sources.bags.scans import ScanTopic, check_topic
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.parameters import mounted
 
-TOPICS = {"cloud": POINT_CLOUD, "scan": LASER_SCAN}
+TOPICS = {"cloud": CLOUDS, "scan": (LASER_SCAN,)}
 MOUNT = "mount=x,y,z,yaw,pitch,roll of the lidar on it"
 
 
@@ -30,11 +30,11 @@ MOUNT = "mount=x,y,z,yaw,pitch,roll of the lidar on it"
 class Options(LidarOptions):
     """Those of all clouds (`LidarOptions`), and:
 
-    cloud: topic of the clouds (`sensor_msgs/PointCloud2`). scan: topic of scans (`sensor_msgs/LaserScan`) to use
-    instead. poses: topic or file of the lidar's poses, or of its body's; default: /tf. mount: where the lidar is on the
-    posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians (0,0,0: the poses are the lidar's).
-    world_frame: as for depth images. deskew: 0 to treat the points of a cloud as measured at once although they have
-    times.
+    cloud: topic of the clouds (`sensor_msgs/PointCloud2`, `PointCloud`, Livox's `CustomMsg`). scan: topic of scans
+    (`sensor_msgs/LaserScan`) to use instead. poses: topic or file of the lidar's poses, or of its body's; default: /tf.
+    mount: where the lidar is on the posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians
+    (0,0,0: the poses are the lidar's). world_frame: as for depth images. deskew: 0 to treat the points of a cloud as
+    measured at once although they have times.
     """
 
     cloud: str = ""
@@ -71,7 +71,7 @@ class BagClouds(CloudSource):
             raise SourceError(f"{where}: has {' and '.join(given)}; give one of ?cloud= and ?scan=")
         ((key, topic),) = given.items()
         self._file = open_bag(Path(path))
-        check_topic(self._file, topic, (TOPICS[key],), key)
+        check_topic(self._file, topic, TOPICS[key], key)
         self._scans = ScanTopic(self._file, topic, self._options.range_max)
         self.name, self.lidar = f"{Path(path).name} {topic}", self._options.lidar
         mount = mounted("mount", self._options.mount)
@@ -114,7 +114,12 @@ class BagClouds(CloudSource):
             found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic,
             pose_off_ns=self._off_ns(message.frame_id, message.stamp_ns),
         )  # fmt: skip
-        times = message.times_s if isinstance(message, PointCloud) and self._options.deskew else None
+        times = None
+        if isinstance(message, PointCloud) and self._options.deskew:
+            if message.fault:
+                detail = f"{self.file(i)}: {message.fault}; add ?deskew=0 for clouds measured at once"
+                raise FrameRefused("no_pose", detail)
+            times = message.times_s
         return found if times is None else deskewed(found, times, pose_at)
 
     def _pose_at(self, frame_id: str, stamp_ns: int) -> np.ndarray:
@@ -156,7 +161,9 @@ class BagClouds(CloudSource):
             message = self._scans.read(0)
         except FrameRefused:
             return ()
-        if isinstance(message, PointCloud) and message.times_s is None:
+        if isinstance(message, PointCloud) and message.times:
+            return (f"{self.name}: times of its points are {message.times}; if that is wrong, add ?deskew=0",)
+        if isinstance(message, PointCloud) and message.times_s is None and not message.fault:
             return (f"{self.name}: its points have no times, so each cloud counts as measured at once",)
         return ()
 

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from made_depth import K, camera_text, matrix_line, posed, render, tum_line, units, write
+from made_recordings import write_png
 
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.opening import open_source
+from stereovox.opening import open_images, open_source
 from stereovox.sources.rgbd.depth_unit import UNITS, find_unit, pairs_of
 
 COUNT = 8
@@ -94,3 +97,45 @@ def test_pairs_are_taken_where_the_camera_moved_enough():
     assert pairs
     for first, second in pairs:
         assert np.linalg.norm(first.T_world_camera[:3, 3] - second.T_world_camera[:3, 3]) > 0.03
+
+
+def recorder(folder, names, raw, camera="camera_intrinsic.json"):
+    """Write what Open3D's recorder does (or another): depth/ and the camera, no poses; `raw`: values of the images."""
+    for k, name in enumerate(names):
+        write_png(folder / f"depth/{name}.png", np.roll(raw, k, axis=1))
+    K = [600.0, 0, 0, 0, 600, 0, 319.5, 239.5, 1]
+    table = {"width": raw.shape[1], "height": raw.shape[0], "intrinsic_matrix": K}
+    (folder / camera).write_text(json.dumps(table))
+    return folder
+
+
+NUMBERED, TIMED = ["000000", "000001", "000002"], [f"1305031102.{k}60407" for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("names", "spread", "unit", "sure"),
+    [
+        (NUMBERED, (700, 5000), 1 / 1000, False),  # a D435 in a room
+        (NUMBERED, (300, 900), 1 / 1000, False),  # a D405 above a table
+        (NUMBERED, (8000, 24000), 1 / 5000, False),  # 1.6 to 4.8 m; in millimetres a hall of 16 m
+        (TIMED, (700, 5000), 1 / 1000, False),  # in TUM's layout, but no room is 0.6 m wide
+        (TIMED, (4000, 24000), 1 / 5000, False),
+    ],
+)
+def test_without_poses_the_values_tell_the_unit_and_a_note_names_it(tmp_path, names, spread, unit, sure):
+    raw = np.random.default_rng(3).integers(*spread, (480, 640)).astype(np.uint16)
+    source = open_images(recorder(tmp_path, names, raw))
+    assert (source.depth_scale, source.unit.sure) == (unit, sure)
+    (note,) = (note for note in source.notes if note.startswith("depth is assumed to be in"))
+    assert f"{tmp_path}?depth_scale=" in note
+    fives = open_images(recorder(tmp_path / "kinect", names, raw // 5 * 5))
+    if np.median(raw) > 2500:  # millimetres times five: TUM's own
+        assert (fives.depth_scale, fives.unit.sure) == (1 / 5000, True)
+
+
+def test_numbered_images_are_not_one_a_second(tmp_path):
+    raw = np.full((480, 640), 1500, np.uint16)
+    frames = list(open_images(recorder(tmp_path, NUMBERED, raw)))
+    assert [frame.stamp_ns for frame in frames] == [0, 33_333_333, 66_666_666]
+    assert any("30 a second" in note for note in open_images(tmp_path).notes)
+    assert not any("a second" in note for note in open_images(recorder(tmp_path / "b", TIMED, raw)).notes)

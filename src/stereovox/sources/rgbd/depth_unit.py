@@ -49,6 +49,11 @@ WORST = 0.06
 LIKELY_M = 0.25, 40.0
 """Plausible median depths of a scene in metres, used if there is no other evidence."""
 
+TUM_UNIT, ROOM_M = 1 / 5000, (0.7, 8.0)
+"""TUM's unit, and usual median depths of images of rooms."""
+IN_FIVES, FIVES_FROM = 0.999, 2500.0
+"""Share of values that are multiples of five, and their smallest median, that identify TUM's unit."""
+
 
 class DepthUnit(NamedTuple):
     """Unit of depth images.
@@ -112,6 +117,26 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
     if best:
         return _unchecked(pairs, expected)
     return DepthUnit(expected, all(beaten), f"{why}; but half the depths are beyond {far:.3g} m", False)
+
+
+def unit_by_values(images: Sequence[Depth], expected: float, told: bool = False) -> DepthUnit:
+    """Find the unit of images without poses by their values alone: millimetres, TUM's 1/5000 m, or the expected one.
+
+    TUM's images of real cameras are millimetres times five. Any other choice is not certain, unless the expected unit
+    is `told` by the recording; floats are metres.
+    """
+    if told or all(image.dtype.kind == "f" for image in images):
+        return DepthUnit(expected, True, "as the recording says")
+    values = np.concatenate([np.empty(0), *(image[_usable(image)] for image in images if image.dtype.kind in "ui")])
+    if not len(values):
+        return DepthUnit(expected, False, "no image has a value")
+    if np.mean(values % 5 == 0) > IN_FIVES and float(np.median(values)) > FIVES_FROM:
+        return DepthUnit(TUM_UNIT, True, "all values are multiples of five")
+    units = [expected, *(unit for unit in (0.001, TUM_UNIT) if unit != expected and expected in (0.001, TUM_UNIT))]
+    middles = [float(np.median(values)) * unit for unit in units]
+    usual = next((k for k, middle in enumerate(middles) if ROOM_M[0] <= middle <= ROOM_M[1]), 0)
+    why = f"half the depths are then below {middles[usual]:.3g} m, and nothing else can check it"
+    return DepthUnit(units[usual], False, why, ROOM_M[0] <= middles[usual] <= ROOM_M[1])
 
 
 def _percent(share: float) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -30,11 +31,13 @@ from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
-from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
+from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_by_values, unit_words
 from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, in_other_hand, number_in, read_poses
 from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 
 SECOND = 1_000_000_000
+UNIT_NOTE, SAMPLED = "depth is assumed to be in", 5
+"""Begin of the note about an uncertain unit, and how many images are inspected for it without poses."""
 PHOTO_NS, PHOTOS_TRIED = 20_000_000, 5
 """Largest time between a picture and its depth image, and how many pictures are tried for their size."""
 
@@ -143,9 +146,11 @@ class DepthFolder(DepthSource, ABC):
         self.posed = self.posed and (self._poses is not None or self._has_own_poses())
         self.camera, notes, self._mirrored, scale = self._find_camera()
         expected = scale or (1.0 if self._dtype().kind == "f" else self.depth_scale)
-        self.unit = self._find_unit(expected)
+        self.unit = self._find_unit(expected, bool(scale))
         unit_note = () if self.options.depth_scale else self._unit_note(expected)
         self.depth_scale = self.unit.scale
+        if not (self.posed or self.certain or self.options.fps) and self._invented_times():
+            self.notes += (self._rate_note(),)
         self.notes = (*self.notes, *notes, *unit_note, *self._misfit(expected))
 
     @classmethod
@@ -285,8 +290,7 @@ class DepthFolder(DepthSource, ABC):
         Raises SourceError if their number differs and neither numbers nor times assign them.
         """
         numbers, known = self.numbers(), image_numbers(found)
-        stamps = [image.stamp_ns for image in self._images]
-        invented = any(stamps == [int(n * SECOND / self.fps) for n in which] for which in (numbers, range(len(self))))
+        invented = self._invented_times()
         shifted = len(found) == len(self) and known is not None and set(known) != set(numbers)
         poses = found if isinstance(found, ImagePoses) else in_order(found)
         if invented and known is not None and not shifted and 2 * len(set(known) & set(numbers)) >= len(self):
@@ -295,7 +299,7 @@ class DepthFolder(DepthSource, ABC):
             first, last = self._images[0].stamp_ns, self._images[-1].stamp_ns
             if found.stamps_ns[0] <= last and first <= found.stamps_ns[-1]:
                 if invented:
-                    self.notes += (f"images are assumed to be {self.fps:g} a second; else give {self.folder}?fps=15",)
+                    self.notes += (self._rate_note(),)
                 return found
         if len(found) != len(self):
             raise SourceError(
@@ -303,28 +307,49 @@ class DepthFolder(DepthSource, ABC):
             )
         return poses
 
+    def _invented_times(self) -> bool:
+        """Return whether the images' times are only their numbers."""
+        stamps = [image.stamp_ns for image in self._images]
+        return any(
+            stamps == [int(n * SECOND / self.fps) for n in which] for which in (self.numbers(), range(len(self)))
+        )
+
+    def _rate_note(self) -> str:
+        return f"images are assumed to be {self.fps:g} a second; else give {self.folder}?fps=15"
+
     def _find_camera(self) -> FoundCamera:
         size = self.size()
         if self.options.camera:
             return camera_in(self._file(self.options.camera), size, self.baseline)
         return self.find_camera(size)
 
-    def _find_unit(self, expected: float) -> DepthUnit:
-        """Return the unit of the images; `expected`: metres per unit by convention, or from the camera's file."""
+    def _find_unit(self, expected: float, told: bool) -> DepthUnit:
+        """Return the unit of the images; `expected`: metres per unit by convention, or, if `told`, as the camera's
+        file says."""
         if self.options.depth_scale:
             return DepthUnit(metres_per_unit(self.options.depth_scale), True, "as ?depth_scale= says")
+        if not self.posed and not self.certain:
+            return unit_by_values(self._some_images(), expected, told)
         pairs = pairs_of(len(self), self.pose, self.read) if self.posed else []
         return find_unit(pairs, self.camera, expected)
+
+    def _some_images(self) -> list[Depth]:
+        """Return a few readable images, spread over the recording."""
+        found = []
+        for i in np.unique(np.linspace(0, len(self) - 1, SAMPLED).astype(int)).tolist():
+            with suppress(FrameRefused):
+                found.append(self.read(i))
+        return found
 
     def _unit_note(self, expected: float) -> tuple[str, ...]:
         """Return a note if the unit is not the `expected` one, or is neither checked nor certain."""
         unit, usual = self.unit, abs(self.unit.scale / expected - 1) < 1e-6
-        if usual and unit.plausible and (unit.sure or self.certain or not self.posed):
+        if usual and unit.plausible and (unit.sure or self.certain):
             return ()
         contrary = "" if usual else f", not {unit_words(expected)}"
         override = f"else give {self.folder}?depth_scale={5000 if unit.scale == 0.001 else 1000}"
         poses = "&poses_scale=0.001" if unit.sure and not unit.plausible else ""  # they agree in any common unit
-        return (f"depth is assumed to be in {unit.words}{contrary} ({unit.why}); {override}{poses}",)
+        return (f"{UNIT_NOTE} {unit.words}{contrary} ({unit.why}); {override}{poses}",)
 
     def _misfit(self, expected: float) -> tuple[str, ...]:
         """Return a note if poses do not fit the images, whose unit is `expected` by convention."""

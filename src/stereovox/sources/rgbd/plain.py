@@ -108,7 +108,7 @@ class DepthAndPoses(DepthFolder):
         return posed and has_depth(folder)
 
     @classmethod
-    def depth_only(cls, where: str) -> DepthOnly:
+    def depth_only(cls, where: str) -> DepthAndPoses:
         """Return the images without searching for poses: every pose is NaN."""
         return DepthOnly(where)
 

@@ -19,6 +19,7 @@ from stereovox.sources.bags import suffix_of
 from stereovox.sources.base import DepthSource
 from stereovox.sources.poses.poses import Poses, seconds_from_ns
 from stereovox.sources.poses.tracker import jumps, on_clock, read_tracker
+from stereovox.sources.rgbd.folder import UNIT_NOTE
 from stereovox.sources.rigs.pair_file import FILE, PairSettings, read_pair
 
 NEAR_JUMP_NS = 100_000_000
@@ -174,7 +175,9 @@ class CorrectedDepth(DepthSource):
 
     def __init__(self, source: DepthSource, settings: PairSettings):
         self._source, self._scale = source, settings.depth_scale
-        self.name, self.notes = source.name, source.notes
+        self.name = source.name
+        told = () if self._scale is None else (UNIT_NOTE,)
+        self.notes = tuple(note for note in source.notes if not note.startswith(told))
         self.camera: PinholeCamera = source.camera
         if settings.baseline is not None:
             self.camera = replace(source.camera, baseline=settings.baseline)

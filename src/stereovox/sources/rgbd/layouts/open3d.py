@@ -23,6 +23,11 @@ class Open3DFolder(DepthAndPoses):
     intrinsics = (525.0, 525.0, 319.5, 239.5)
 
     @classmethod
+    def depth_only(cls, where: str) -> Open3DFolder:
+        """Return the images, with the camera of this layout, without searching for poses: every pose is NaN."""
+        return cls(where, posed=False)
+
+    @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with depth images and Open3D's trajectory."""
         folder = folder_part(where)

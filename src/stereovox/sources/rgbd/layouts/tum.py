@@ -81,10 +81,11 @@ class StampedImages(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with a list of depth images or a folder of them."""
-        folder = folder_part(where)
-        lists = any(os.path.isfile(os.path.join(folder, name)) for name in (LIST, *PAIRED))
-        return lists or os.path.isdir(os.path.join(folder, IMAGES))
+        """Return whether `where` is a folder with a list of depth images, or a folder of them named by their times.
+
+        Numbered images are not TUM's: recorders of depth cameras write those, in millimetres (see `DepthOnly`).
+        """
+        return _is_stamped(Path(folder_part(where)))
 
 
 class TumRgbd(StampedImages):
@@ -118,9 +119,9 @@ class TumRgbd(StampedImages):
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with poses, and a list or folder of depth images."""
         folder = folder_part(where)
-        if not super().recognises(where):
-            return False
-        return os.path.isfile(os.path.join(folder, POSES)) or (_is_stamped(Path(folder)) and _posed(where))
+        if os.path.isfile(os.path.join(folder, POSES)):
+            return super().recognises(where) or os.path.isdir(os.path.join(folder, IMAGES))
+        return super().recognises(where) and _posed(where)
 
     @classmethod
     def depth_only(cls, where: str) -> StampedImages:

@@ -23,7 +23,7 @@ from stereovox.formats.read_points import cells_of_points
 from stereovox.formats.text_points import read_text_points
 from stereovox.maps import VoxelMap
 from stereovox.maps.record.history import Imported
-from stereovox.sources.lidar import read_velodyne
+from stereovox.sources.lidar import find_layout, read_velodyne
 from stereovox.sources.point_files import MAX_BYTES, read_points
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937}
@@ -240,7 +240,7 @@ def _shares(steps: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.flo
 def _lidar_scan(path: str | Path) -> PointFile:
     """Return the points of a KITTI velodyne scan, in the frame of the lidar."""
     try:
-        xyz = read_velodyne(Path(path)).astype(np.float64)
+        xyz = read_velodyne(Path(path), find_layout(Path(path))).astype(np.float64)
     except StereovoxError as error:
         raise MapFileError(str(error)) from None
     if not len(xyz) or np.abs(xyz).max() > MAX_LIDAR_M:

@@ -4,6 +4,8 @@
 import made_kitti
 import numpy as np
 import pytest
+from made_clouds import pose as made_pose
+from made_clouds import room_points
 from made_robot_bags import MS, START_NS, Messages, RobotBagMaker, planar_motion, planar_numbers
 
 import stereovox as sv
@@ -445,3 +447,48 @@ def test_clouds_of_the_first_version_and_of_livox(tmp_path, ros):
         for length in range(0, len(data), 3):
             with pytest.raises(ValueError, match=r"bytes are announced|numbers"):
                 read_point_cloud(Wire(data[:length], cdr=ros == 2), kind, 0.1)
+
+
+def lidar_points(order, seed=1):
+    """What a lidar of 16 rings measures in a room, in the order of its rings, of its columns, or in none."""
+    elevation, azimuth = np.radians(np.linspace(-15, 15, 16)), np.linspace(-np.pi, np.pi, 400, endpoint=False)
+    e, a = np.meshgrid(elevation, azimuth, indexing="ij" if order == "rings" else "xy")
+    if order == "rings":
+        e, a = e.ravel(), a.ravel()
+    directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1).reshape(-1, 3)
+    points = room_points(made_pose(0.7, 0.4), directions) + np.random.default_rng(seed).normal(0, 0.01, (6400, 3))
+    return np.random.default_rng(seed).permutation(points) if order == "none" else points
+
+
+@pytest.mark.parametrize("order", ["rings", "columns", "none"])
+@pytest.mark.parametrize(("columns", "dtype"), [(3, "<f4"), (4, "<f4"), (5, "<f4"), (6, "<f4"), (3, "<f8"), (4, "<f8")])
+def test_raw_clouds_of_any_maker(tmp_path, order, columns, dtype):
+    """x, y, z, then intensity, ring (nuScenes) and time."""
+    points = lidar_points(order)
+    rest = [np.random.default_rng(0).uniform(0, 1, 6400), np.arange(6400) % 16, np.linspace(0, 0.1, 6400)]
+    table = np.column_stack([points, *rest])[:, :columns].astype(dtype)
+    (tmp_path / "scans").mkdir()
+    for n in range(2):
+        table.tofile(tmp_path / f"scans/{n:06d}.bin")
+    write_poses(tmp_path, [0, 10**8])
+    source = sv.open_source(tmp_path)
+    np.testing.assert_allclose(source.frame(1).points, points, atol=1e-5)
+    assert any("a point" in note for note in source.notes) is ((columns, dtype) != (4, "<f4"))
+
+
+def test_raw_clouds_of_an_unknown_layout_are_refused(tmp_path):
+    (tmp_path / "scans").mkdir()
+    lidar_points("rings").T.astype("<f4").tofile(tmp_path / "scans/000000.bin")  # all x, then all y, then all z
+    write_poses(tmp_path, [0])
+    with pytest.raises(SourceError, match=r"not known how many numbers a point has.*\?columns="):
+        sv.open_source(tmp_path)
+    assert sv.open_source(f"{tmp_path}?columns=3").frame(0).fault is None
+    with pytest.raises(SourceError, match="columns=2 must be 3 to 32"):
+        sv.open_source(f"{tmp_path}?columns=2")
+
+
+def test_a_lidar_on_a_body_whose_poses_a_folder_holds(folder):
+    mount = sv.open_source(f"{folder}?mount=0.5,0,1,0,0,{np.pi}")  # upside down
+    T = np.diag([1.0, -1, -1, 1])
+    T[:3, 3] = 0.5, 0, 1
+    np.testing.assert_allclose(mount.frame(1).T_world_sensor, pose(1) @ T, atol=1e-6)

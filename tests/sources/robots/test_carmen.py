@@ -87,6 +87,14 @@ def test_marks_of_no_echo_are_found_by_the_gap_below_them(tmp_path, mark, betwee
     assert robot.scans[0].range_max < 82
 
 
+def test_a_mark_of_no_echo_just_below_the_declared_range(tmp_path):
+    line = robotlaser([1.0, 2.0, *[81.83] * 3], [0, 0, 0], [0, 0, 0]).replace(" 20.0 ", " 81.9 ")
+    scan = CarmenLog(log(tmp_path, line * 10)).scans[0]
+    assert np.isfinite(scan.ranges).tolist() == [True, True, False, False, False]
+    far = robotlaser([1.0, 70.0, *[81.83] * 3], [0, 0, 0], [0, 0, 0]).replace(" 20.0 ", " 81.9 ")
+    assert np.isfinite(CarmenLog(log(tmp_path, far * 10)).scans[0].ranges).all()
+
+
 def test_without_an_echo_nothing_is_known_unless_one_says_so(tmp_path):
     path = log(tmp_path, flaser([1.0, 81.91]))
     assert np.isnan(CarmenLog(path).scans[0].ranges[1])

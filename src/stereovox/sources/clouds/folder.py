@@ -18,8 +18,8 @@ from stereovox.frame.validate import MAX_INT
 from stereovox.sources.base import Part
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.images import file_names
-from stereovox.sources.lidar import read_velodyne
-from stereovox.sources.parameters import file_of
+from stereovox.sources.lidar import BinLayout, find_layout, read_velodyne
+from stereovox.sources.parameters import file_of, mounted
 from stereovox.sources.point_files import read_points
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds
@@ -34,6 +34,8 @@ NANOSECONDS = re.compile(r"\d{16,19}")
 SECONDS = re.compile(r"\d{1,10}\.\d+")
 NUMBERED = re.compile(r"\d{2}$|^\d+$")
 """Endings of the names of KITTI's clouds; points3D.bin is not one."""
+MAX_COLUMNS, TRIED = 32, 5
+"""Most numbers a point in a `.bin`, and most files tried to find their layout."""
 RATE_HZ = 10.0
 """Default clouds per second, if no times are given: the rate of most spinning lidars."""
 
@@ -43,15 +45,21 @@ class Options(LidarOptions):
     """Those of all clouds (`LidarOptions`), and:
 
     poses: file of the poses, of any form, instead of the folder's own. axes: axes of the
-    posed body if it is not the lidar (x forward, y left, z up): `optical`, `opengl` or `ned`. fps: clouds per
-    second, if they have no times.
+    posed body if it is not the lidar (x forward, y left, z up): `optical`, `opengl` or `ned`. mount: where the lidar is
+    on that body: x,y,z in metres, then yaw, pitch and roll in radians. fps: clouds per second, if they have no times.
+    columns: float32 numbers a point in `.bin` files (0: found from the files, else KITTI's 4).
     """
 
     poses: str = ""
     axes: str = ""
+    mount: str = ""
     fps: float = 0.0
+    columns: int = 0
 
     def __post_init__(self) -> None:
+        mounted("mount", self.mount)
+        if not (self.columns == 0 or 3 <= self.columns <= MAX_COLUMNS):
+            raise SourceError(f"columns={self.columns} must be 3 to {MAX_COLUMNS}: numbers a point of the .bin files")
         if self.axes and self.axes not in AXES:
             raise SourceError(f"axes={self.axes} is unknown{did_you_mean(self.axes, AXES)}")
         if self.fps < 0:
@@ -67,6 +75,7 @@ class CloudFolder(CloudSource):
         cloud.
     Times: from the files' names, if these are seconds with a fraction or nanoseconds; else lines of seconds in
         `times.txt`; else 10 clouds a second, with a note.
+    A `.bin` has 3 to 8 numbers a point, float32 or float64: x, y, z first (KITTI 4, nuScenes 5), found from the files.
     Faults: `unreadable`, `no_pose`, `bad_pose_file`.
     Raises SourceError if there is no cloud, or times and poses do not fit.
     """
@@ -94,6 +103,10 @@ class CloudFolder(CloudSource):
         self._T_body_lidar = np.eye(4)
         if options.axes and options.axes != "ros":
             self._T_body_lidar[:3, :3] = AXES[options.axes].T @ AXES["ros"]
+        mount = mounted("mount", options.mount)
+        if mount is not None:
+            self._T_body_lidar = mount @ self._T_body_lidar
+        self._layout = self._find_layout(options.columns)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -118,8 +131,24 @@ class CloudFolder(CloudSource):
     def cloud(self, i: int) -> Cloud:
         """Return cloud `i`."""
         path, T = self._files[i], self._poses.at(self._stamps[i]) @ self._T_body_lidar
-        points = read_velodyne(path) if path.suffix.lower() == ".bin" else _measured(path)
+        points = read_velodyne(path, self._layout) if path.suffix.lower() == ".bin" else _measured(path)
         return Cloud(points, T, self._stamps[i], self.lidar, name=str(path))
+
+    def _find_layout(self, columns: int) -> BinLayout:
+        """Return the layout of `.bin` files; raises SourceError if it cannot be found."""
+        if columns:
+            return BinLayout(columns)
+        for path in [path for path in self._files if path.suffix.lower() == ".bin"][:TRIED]:
+            try:
+                found = find_layout(path)
+            except FrameRefused as refused:
+                if "columns=" in str(refused):
+                    raise SourceError(str(refused)) from None
+                continue  # reported when it is read
+            if found != BinLayout():
+                self.notes = (*self.notes, f"{self.name}: its .bin files have {found.words} (?columns=)")
+            return found
+        return BinLayout()
 
     def _times(self, folder: Path, fps: float) -> list[int]:
         """Return the times of all clouds; times in names need not ascend: 7.5 sorts behind 7.25."""

@@ -59,7 +59,7 @@ class CarmenLog:
         self._readings = sorted(found, key=lambda reading: reading.stamp_ns)
         if not self._readings:
             raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
-        self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
+        self._max_range = options.max_range or _no_echo(self._readings, self._readings[0].max_range)
         self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
         self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_VALUES[options.no_echo])
         self.frames: Sequence[Frame] = ()
@@ -248,20 +248,21 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
     return bz2.open(path) if path.suffix.lower() == ".bz2" else path.open("rb")
 
 
-def _no_echo(readings: list[Reading]) -> float:
+def _no_echo(readings: list[Reading], declared: float) -> float:
     """Return the range from which on a laser means "no echo".
 
-    It is the largest range of the log if many beams have it and none lies just below it; else whichever of a SICK's two
-    conventions peaks in the log.
+    It is the largest range of the log if many beams have it and none lies just below it, unless a smaller one is
+    `declared` (0: none is); else that; else whichever of a SICK's two conventions peaks in the log.
     """
     ranges = np.concatenate([reading.ranges for reading in readings])
     ranges = ranges[np.isfinite(ranges)]
     largest = float(ranges.max(initial=0.0))
     known = min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=0.0)
-    if known:
+    if known and not declared:
         return known
     top, below = int((ranges >= TOP * largest).sum()), int((ranges >= GAP * largest).sum())
-    return TOP * largest if top == below >= max(SPIKE * len(ranges), FEWEST) else NO_ECHO[-1]
+    spike = top == below >= max(SPIKE * len(ranges), FEWEST)
+    return min(TOP * largest if spike else declared or NO_ECHO[-1], declared or np.inf)
 
 
 def _notes(path: Path, damaged: list[str], max_range: float, no_echo: str) -> Iterator[str]:

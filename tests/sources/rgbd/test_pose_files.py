@@ -159,3 +159,80 @@ def test_the_last_number_of_a_name_counts():
     assert sorted(["frame10.png", "frame9.png", "cam1_2.png", "x.png"], key=number_in) == [
         "x.png", "cam1_2.png", "frame9.png", "frame10.png",
     ]  # fmt: skip
+
+
+STAMPS = [1_403_715_278_762_142_976 + k * 50_000_000 for k in range(4)]
+
+
+def rows_of(poses, order="xyzw"):
+    """Positions and quaternions of poses, as text, by scipy."""
+    quaternions = [dict(zip("xyzw", Rotation.from_matrix(T[:3, :3]).as_quat(), strict=True)) for T in poses]
+    return [[*map(str, T[:3, 3]), *(str(q[k]) for k in order)] for T, q in zip(poses, quaternions, strict=True)]
+
+
+def timed_forms():
+    """Files as their programs write them: name, heading, separator, rows; times in nanoseconds unless said."""
+    xyzw, wxyz, zero = rows_of(posed()), rows_of(posed(), "wxyz"), ["0.1", "0.2", "0.3"]
+    matrices = [list(map(str, T[:3].ravel())) for T in posed()]
+    vectors = [[*map(str, Rotation.from_matrix(np.linalg.inv(T)[:3, :3]).as_rotvec()),
+                *map(str, np.linalg.inv(T)[:3, 3])] for T in posed()]  # fmt: skip
+    euroc = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    euroc += "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]"
+    echo = "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,"
+    echo += ",".join(f"field.pose.pose.position.{k}" for k in "xyz") + ","
+    echo += ",".join(f"field.pose.pose.orientation.{k}" for k in "xyzw") + ",field.pose.covariance0,"
+    echo += ",".join(f"field.twist.twist.linear.{k}" for k in "xyz")
+    vins = "# timestamp(s) tx ty tz qx qy qz qw Pr11 Pr12 Pr13 Pr22 Pr23 Pr33 Pt11 Pt12 Pt13 Pt22 Pt23 Pt33"
+    ns, ms = list(map(str, STAMPS)), [str(stamp // 10**6) for stamp in STAMPS]
+    split = [[str(stamp // 10**9), str(stamp % 10**9)] for stamp in STAMPS]
+    seconds = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in STAMPS]
+    both = list(zip(ns, xyzw, wxyz, strict=True))
+    return {
+        "EuRoC": (euroc, ",", [[t, *w, *zero, "0.5"] for t, _, w in both]),
+        "rostopic -p": (echo, ",", [[t, "7", t, "odom", "base", *q, "0.01", *zero] for t, q, _ in both]),
+        "AirSim": ("VEHICLE TIMESTAMP POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile".replace(" ", "\t"), "\t",
+                   [["", t, *w, "img_0.png"] for t, w in zip(ms, wxyz, strict=True)]),
+        "OpenVINS": (vins, " ", [[t, *q, *["0.01"] * 12] for t, q in zip(seconds, xyzw, strict=True)]),
+        "Newer College": ("#sec,nsec,x,y,z,qx,qy,qz,qw", ",", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
+        "the same without a heading": ("", " ", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
+        "VINS": ("", ",", [[t, *w, *zero, ""] for t, _, w in both]),
+        "MulRan": ("", ",", [[t, *m] for t, m in zip(ns, matrices, strict=True)]),
+        "ARKit": ("", " ", [[t, *v] for t, v in zip(seconds, vectors, strict=True)]),
+        "TUM in nanoseconds": ("", " ", [[t, *q] for t, q, _ in both]),
+        "TUM in microseconds": ("", " ", [[str(int(t) // 1000), *q] for t, q, _ in both]),
+        "TUM in milliseconds": ("", " ", [[t, *q] for t, q in zip(ms, xyzw, strict=True)]),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", timed_forms())
+def test_poses_over_time_by_their_columns(tmp_path, name):
+    heading, separator, rows = timed_forms()[name]
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{heading}\n" * bool(heading) + "".join(f"{separator.join(row)}\n" for row in rows))
+    found = read_poses(path)
+    assert isinstance(found, Poses)
+    np.testing.assert_allclose(found.stamps_ns, STAMPS, atol=1e6, rtol=0)
+    np.testing.assert_allclose(found.T_world_body, posed(), atol=1e-8)
+
+
+def test_poses_with_numbers(tmp_path):
+    lines = {
+        "KITTI-360": "".join(f"{7 * k} {matrix_line(T, 3)}" for k, T in enumerate(posed())),
+        "its cameras": "".join(f"{7 * k} {matrix_line(T)}" for k, T in enumerate(posed())),
+    }
+    for name, text in lines.items():
+        (tmp_path / "p.txt").write_text(text)
+        found = read_poses(tmp_path / "p.txt")
+        assert isinstance(found, ImagePoses), name
+        assert found.numbers == [0, 7, 14, 21]
+        np.testing.assert_allclose([found.at(k) for k in range(4)], posed(), atol=1e-9)
+    graph = "".join(f"VERTEX_SE3:QUAT {k} {' '.join(row)}\n" for k, row in enumerate(rows_of(posed())))
+    (tmp_path / "graph.g2o").write_text(f"{graph}FIX 0\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {'1 ' * 21}\n")
+    np.testing.assert_allclose([read_poses(tmp_path / "graph.g2o").at(k) for k in range(4)], posed(), atol=1e-8)
+
+
+def test_a_confidence_is_no_nanosecond_and_seven_numbers_are_a_quaternion(tmp_path):
+    (tmp_path / "t.txt").write_text("".join(f"{k}.5 {' '.join(row)} 3\n" for k, row in enumerate(rows_of(posed()))))
+    found = read_poses(tmp_path / "t.txt")
+    assert isinstance(found, Poses)
+    assert found.stamps_ns.tolist() == [500_000_000 + k * 10**9 for k in range(4)]

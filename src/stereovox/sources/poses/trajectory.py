@@ -19,6 +19,8 @@ from stereovox.sources.poses.poses import seconds_from_ns as seconds_from_ns
 
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""
+MILLISECOND_DIGITS = 12
+"""Fewest digits of a date in milliseconds."""
 TRAJECTORY_ENDINGS = (".tum", ".txt")
 FORMAT = "stamp tx ty tz qx qy qz qw"
 StampedLine = tuple[int, str, str]
@@ -137,6 +139,22 @@ def ns_from_seconds(text: str) -> int:
     return round(seconds * 1_000_000_000)
 
 
+def ns_from_stamp(text: str) -> int:
+    """Return the nanoseconds of a time in seconds, or, if the number is too large for a date in seconds, in
+    milliseconds, microseconds or nanoseconds: dates from 1973 to 5138 have 12 to 14, 15 to 17, and more digits.
+
+    Raises ValueError as `ns_from_seconds`.
+    """
+    digits = len(text.lstrip("+-").partition(".")[0])
+    if digits < MILLISECOND_DIGITS or not text.lstrip("+-").replace(".", "", 1).isdigit():
+        return ns_from_seconds(text)
+    number = Decimal(text)
+    found = round(number * (1_000_000, 1000, 1)[min((digits - MILLISECOND_DIGITS) // 3, 2)])
+    if abs(found) >= LIMIT * 1_000_000_000:
+        raise ValueError(f"'{text[:40]}' is not a time")
+    return found
+
+
 def _plain(line: str) -> str:
     return line.partition("#")[0].replace(",", " ").strip()
 
@@ -144,6 +162,6 @@ def _plain(line: str) -> str:
 def _parse(line: str, where: str) -> StampedLine:
     stamp, *rest = line.split(maxsplit=1)
     try:
-        return ns_from_seconds(stamp), "".join(rest), where
+        return ns_from_stamp(stamp), "".join(rest), where
     except ValueError as error:
         raise SourceError(f"{where}: {error}; correct or delete the line") from None

@@ -11,9 +11,16 @@
 | log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
 | JSON | a PinholeCameraTrajectory (world to camera, which is inverted) | Open3D |
 | NumPy | `.npy` of (N, 4, 4), (N, 16), (N, 12) or (N, 7) numbers | scripts |
+| named columns | a time, positions and quaternions, named in a heading | EuRoC, AirSim, `rostopic -p`, OpenVINS |
+| VINS | `stamp tx ty tz qw qx qy qz vx vy vz` | VINS-Mono, VINS-Fusion |
+| numbered | a number or a time in nanoseconds, then 12 or 16 numbers | KITTI-360, MulRan |
+| split time | `sec nsec tx ty tz qx qy qz qw` | Newer College |
+| ARKit | `stamp rx ry rz tx ty tz`, world to camera (inverted) | ARKitScenes |
+| g2o | `VERTEX_SE3:QUAT id tx ty tz qx qy qz qw` | pose graphs |
 | a folder | a file for each image, with 16 or 12 numbers or `tx ty tz qx qy qz qw` | ScanNet, 7-Scenes |
 
-All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) differ.
+All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) differ. Times are
+in seconds, or, if they have more digits than a date in seconds, in milliseconds, microseconds or nanoseconds.
 """
 
 from __future__ import annotations
@@ -31,12 +38,21 @@ from stereovox.files.safe_io import MAX_LIST, is_number, read_bounded, read_json
 from stereovox.geometry.se3 import Transform, from_quaternion, inverse
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES
-from stereovox.sources.poses.trajectory import Trajectory
+from stereovox.sources.poses.trajectory import MILLISECOND_DIGITS, Trajectory, ns_from_stamp, transforms
 
 FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
 MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
 """Turn left-handed poses into right-handed ones, see `in_other_hand`."""
 SECOND = 1_000_000_000
+POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+UNITS_NS = {"ns": 1, "nsec": 1, "us": 1000, "ms": 1_000_000}
+NOT_PLACES = ("vel", "lin", "ang", "twist", "acc", "cov", "gyro", "bias", "omega")
+"""Begins of names of columns that hold other vectors than positions."""
+G2O, MAX_HEADING = "VERTEX_SE3:QUAT", 20
+"""Begin of a pose of a graph, and lines in which a heading is searched for."""
+LARGEST_CONFIDENCE, NOT_UNIT, FEW_UNIT = 100, 0.02, 0.2
+"""Largest confidence of a tracker in any unit; by how much a unit quaternion's length may differ from one; share of
+other rows that may have this length by chance."""
 MAX_NUMBER = 10_000_000
 """Whole stamps in seconds below this may be image numbers; times since 1970 are larger."""
 
@@ -94,10 +110,27 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         return read_pose_folder(path)
     if path.suffix.lower() in (".json", ".npy"):
         return _of_json(path) if path.suffix.lower() == ".json" else _of_numpy(path)
+    if (found := _by_names(path)) is not None:
+        return found
     rows = _rows(path)
     widths = {len(row) for row in rows}
+    if (
+        widths == {9}
+        and all(row[1] == int(row[1]) and 0 <= row[1] < SECOND for row in rows)
+        and any(row[1] > LARGEST_CONFIDENCE for row in rows)
+    ):
+        return _over_time(path, [(int(row[0]) * SECOND + int(row[1]), row[2:]) for row in rows])
     if widths and widths <= {8, 9}:  # the ninth: a tracker's confidence
         return Trajectory(path)
+    if widths in ({13}, {17}):
+        return _numbered(path)
+    if widths == {11}:
+        return _over_time(
+            path, [(ns_from_stamp(words[0]), _numbers(words[1:4] + words[5:8] + words[4:5])) for words in _words(path)]
+        )
+    if widths == {7} and _is_arkit(rows):
+        found = [(ns_from_stamp(words[0]), _numbers(words[1:])) for words in _words(path)]
+        return _over_time(path, [(stamp, _of_rotation_vector(numbers)) for stamp, numbers in found])
     if widths in ({7}, {12}, {16}):
         return ImagePoses([_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)], str(path))
     if widths and widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
@@ -108,6 +141,125 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         return _stacked(path, [rows[k : k + 3] for k in range(0, len(rows), 3)])
     many = ", ".join(map(str, sorted(widths)[:5])) or "no"
     raise SourceError(f"{path}: its lines have {many} numbers, which fits no form of poses; write {FORMS}")
+
+
+def _by_names(path: Path) -> Poses | ImagePoses | None:
+    """Return the poses of a file whose columns have names, or of a g2o graph; None for any other."""
+    try:
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
+    except OSError:
+        return None  # reported by `_rows`
+    graph = [line.split() for line in lines if line.startswith(G2O)]
+    if graph:
+        poses = [_matrix(_numbers(words[2:]), f"{path}: vertex {words[1]}") for words in graph if len(words) == 9]
+        return ImagePoses(poses, str(path))
+    for heading in lines[:MAX_HEADING]:
+        names = [_name(word) for word in _split(heading.lstrip("#% "))]
+        columns = {key: k for k, name in reversed(list(enumerate(names))) if (key := _meaning(name))}
+        if columns.keys() >= set(POSE_COLUMNS) and columns.keys() & {"time", "sec"}:
+            break
+    else:
+        return None
+    if len(names) == 8 and [columns.get(key) for key in ("time", *POSE_COLUMNS)] == list(range(8)):
+        return None  # TUM's own
+    found = []
+    for n, line in enumerate(lines, 1):
+        words = _split(line)
+        if line == heading or not words or line.lstrip().startswith(("#", "%")):
+            continue
+        try:
+            stamp_ns = _stamp_of(words, columns, names)
+            found.append((stamp_ns, [float(words[columns[key]]) for key in POSE_COLUMNS]))
+        except (ValueError, IndexError):
+            raise SourceError(f"{path}:{n}: a column of the heading is missing or no number; correct it") from None
+    return _over_time(path, found)
+
+
+def _split(line: str) -> list[str]:
+    if re.search(r"[,;\t]", line):
+        return [word.strip() for word in re.split(r"[,;\t]", line)]
+    return line.split()
+
+
+def _name(word: str) -> tuple[str, ...]:
+    """Return the parts of a column's name: `p_RS_R_x [m]` has p, rs, r, x, m in brackets last."""
+    return tuple(re.findall(r"[a-z]+|\[.*?\]|\(.*?\)", word.lower()))
+
+
+def _meaning(name: tuple[str, ...]) -> str:
+    """Return what a column is: `time`, `sec`, `nsec`, or one of `POSE_COLUMNS`; "" for others."""
+    parts = [part for part in name if part[0] not in "[("]
+    *context, last = parts or [""]
+    if last in ("timestamp", "time", "stamp", "t") or context[:1] in (["timestamp"], ["time"]):
+        return "time"
+    if last in ("sec", "secs", "nsec", "nsecs"):
+        return last.rstrip("s")
+    turns = last[0:1] == "q" or any(part.startswith(("q", "orient", "rot")) for part in context)
+    if turns and last.lstrip("q") in ("x", "y", "z", "w"):
+        return f"q{last.lstrip('q')}"
+    others = any(part in ("v", "b", "a", "w") or part.startswith(NOT_PLACES) for part in context)
+    place = last[1:] if last[:1] in ("t", "p") else last
+    return f"t{place}" if place in ("x", "y", "z") and not others else ""
+
+
+def _stamp_of(words: list[str], columns: dict[str, int], names: list[tuple[str, ...]]) -> int:
+    """Return the time of a row in nanoseconds: its unit is in the heading, else by its digits."""
+    if "sec" in columns and "nsec" in columns:
+        return int(words[columns["sec"]]) * SECOND + int(words[columns["nsec"]])
+    column = columns.get("time", columns.get("sec", 0))
+    unit = next((part.strip("[]()") for part in names[column] if part[0] in "[("), names[column][-1])
+    text = words[column]
+    if unit in UNITS_NS and text.lstrip("-").isdigit():
+        return int(text) * UNITS_NS[unit]
+    return ns_from_stamp(text)
+
+
+def _words(path: Path) -> list[list[str]]:
+    """Return the words of all lines that begin with a number."""
+    lines = (_plain(line) for line in read_text(path, MAX_LIST, "replace").splitlines())
+    return [words for words in lines if words and not re.match("[a-zA-Z]", words[0])]
+
+
+def _numbers(words: Sequence[str]) -> list[float]:
+    return [float(word) for word in words]
+
+
+def _over_time(path: Path, found: Sequence[tuple[int, Sequence[float]]]) -> Poses:
+    """Return poses over time of stamps and `tx ty tz qx qy qz qw`."""
+    if not found:
+        raise SourceError(f"{path}: holds no pose; write {FORMS}")
+    rows = np.array([row for _, row in found], float)
+    bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
+    rows[bad] = np.nan
+    with np.errstate(invalid="ignore"):
+        return Poses([stamp_ns for stamp_ns, _ in found], transforms(rows), where=str(path))
+
+
+def _numbered(path: Path) -> Poses | ImagePoses:
+    """Return the poses of lines of a number, or a time of many digits, and a matrix."""
+    words = _words(path)
+    poses = [_matrix(_numbers(row[1:]), f"{path}, pose {row[0]}") for row in words]
+    if all(row[0].isdigit() and len(row[0]) >= MILLISECOND_DIGITS for row in words):
+        T = [np.full((4, 4), np.nan) if isinstance(one, str) else one for one in poses]
+        return Poses([ns_from_stamp(row[0]) for row in words], np.array(T), where=str(path))
+    return ImagePoses(poses, str(path), [int(float(row[0])) for row in words])
+
+
+def _is_arkit(rows: Sequence[Sequence[float]]) -> bool:
+    """Return whether rows of seven numbers are a time, a rotation vector and a position: their last four are no unit
+    quaternion, and the first ascends.
+    """
+    found = np.array(rows)
+    unit = np.mean(np.abs(np.linalg.norm(found[:, 3:], axis=1) - 1) < NOT_UNIT)
+    return len(found) > 1 and bool(unit < FEW_UNIT) and bool((np.diff(found[:, 0]) > 0).all())
+
+
+def _of_rotation_vector(numbers: Sequence[float]) -> list[float]:
+    """Return tx ty tz qx qy qz qw of a camera from its rotation vector and translation, world to camera."""
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_rotvec(numbers[:3]).inv()
+    return [*(-R.apply(numbers[3:])), *R.as_quat()]
 
 
 def read_pose(path: Path) -> Transform:

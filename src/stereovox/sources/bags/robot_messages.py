@@ -187,7 +187,7 @@ def _livox(wire: Wire) -> PointCloud:
 
 def _timed(cloud: PointCloud, given: NDArray[np.generic], period_s: float) -> PointCloud:
     """Return a cloud with times of its points, or the reason why they cannot be read."""
-    used = np.isfinite(cloud.points).all(axis=1) & cloud.points.any(axis=1)
+    used = np.asarray(np.isfinite(cloud.points).all(axis=1) & cloud.points.any(axis=1), bool)
     try:
         found = sweep_times(given.astype(given.dtype.newbyteorder("=")), used, cloud.stamp_ns, period_s)
     except ValueError as error:

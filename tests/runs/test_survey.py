@@ -98,6 +98,16 @@ def test_a_camera_held_on_its_side_does_not_take_walls_for_floors(tmp_path):
     assert not found.up.sure
 
 
+def test_a_sensor_that_hangs_upside_down_does_not_turn_the_map_over(tmp_path):
+    over = np.diag([-1.0, -1, 1, 1])  # about the optical axis
+    found = survey(recording(tmp_path, poses=[T @ over for T in posed(8)]))
+    settings, lines = found.settings({})
+    assert "up" not in settings  # so that z, the world's, stays
+    assert any(
+        "perhaps -z (the sensor hangs upside down, or the world's z points down); z is" in line for line in lines
+    )
+
+
 def test_a_camera_that_was_turned_over_says_nothing_about_up(tmp_path):
     upright, over = looking((1, 0, 0), (0, 0, 1)), looking((1, 0, 0), (0, 0, -1))
     found = survey(recording(tmp_path, poses=[*upright, *over]))

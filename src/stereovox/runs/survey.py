@@ -55,6 +55,9 @@ FIRST = 10
 HORIZONTAL_SHARE = 0.06
 """Share of the surface that must be horizontal (floor, tables, ceiling) to confirm the up direction."""
 
+HANGING = "-z"
+"""The own up direction of a sensor that is mounted upside down, in the worlds of robots and motion capture."""
+
 
 class UpEstimate(NamedTuple):
     """The up direction in the world of a recording.
@@ -271,6 +274,8 @@ def _seen_up(frames: Sequence[AnyFrame]) -> UpEstimate:
     normals = np.concatenate([np.empty((0, 3)), *normals])
     direction, share = _level_direction(mean / steady, normals)
     axis, off = _axis_near(direction)
+    if axis == HANGING:
+        return UpEstimate(axis, direction, off, False, "the sensor hangs upside down, or the world's z points down")
     if _turns_level(frames, direction):
         return UpEstimate(axis, direction, off, False, "the camera hardly turned about the up direction of its images")
     if not len(normals):  # the mean attitude alone suffices for the axis, not for the angle

@@ -38,3 +38,16 @@ def test_clouds_are_imported(tmp_path):
 
 def test_others_have_none():
     assert cure_of("notes.txt") == ""
+
+
+def test_pointers_of_git_lfs_name_the_command(tmp_path):
+    text = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+    for ending in (".bag", ".mcap", ".db3", ".mkv", ".ply"):
+        (tmp_path / f"walk{ending}").write_text(text)
+        with pytest.raises(SourceError, match=r"is a git-lfs pointer.*: git lfs pull$"):
+            open_source(tmp_path / f"walk{ending}")
+    (tmp_path / "scan/depth").mkdir(parents=True)
+    (tmp_path / "scan/depth/0.png").write_text(text)
+    (tmp_path / "scan/poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(SourceError, match="git lfs pull"):
+        open_source(tmp_path / "scan")

@@ -32,12 +32,27 @@ CURES = {
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".exr", ".npy"), PICTURE),
 }  # fmt: skip
 """Description of each kind of file and its cure, by suffix in lower case; `{file}` is its name quoted for a shell."""
+POINTER, POINTS = b"version https://git-lfs", "is a git-lfs pointer, not the file itself; get that with: git lfs pull"
+"""Begin of such a pointer, and its description."""
 MAX_NAME = 60
 """Longest file name that a message repeats."""
 
 
 def cure_of(path: str | os.PathLike[str]) -> str:
     """Return in less than 200 characters what a file is and how to convert it; "" for others."""
+    if is_pointer(path):
+        return POINTS
     found = CURES.get(os.path.splitext(path)[1].lower(), "")
     name = shlex.quote(os.fspath(path))
     return found.format(file=name if len(name) <= MAX_NAME else "FILE")
+
+
+def is_pointer(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is what git leaves in place of a large file that was not fetched; never raises."""
+    try:
+        if not os.path.isfile(path):
+            return False
+        with open(path, "rb") as file:
+            return file.read(len(POINTER)) == POINTER
+    except (OSError, ValueError):
+        return False

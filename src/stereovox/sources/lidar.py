@@ -138,6 +138,8 @@ def find_layout(path: Path) -> BinLayout:
         fit = fit or sorted(pair for pair in found if pair[0] <= ALIKE)
     fit = [(unlike, one) for unlike, one in fit if not any(_repeats(one, other) for _, other in fit)]
     if not fit or (len(fit) > 1 and fit[1][0] < fit[0][0] + APART):
+        if len(data) % BinLayout().size and not fit:
+            return BinLayout()  # which refuses it as cut off
         said = "not known how many numbers a point has, and of which type"
         raise FrameRefused("unreadable", f"{path}: {said}; convert it to .pcd, or give ?columns= (a folder)")
     return fit[0][1]
@@ -159,7 +161,7 @@ def _unlike(data: bytes, layout: BinLayout) -> float:
         return 1.0
     rows = rows[near.all(axis=1)]
     spread = np.std(rows[:, :2], axis=0)
-    if np.median(np.abs(rows[:, 0] - rows[:, 1])) < STEP * spread.max() or not spread.all():
+    if np.median(np.abs(rows[:, 0] - rows[:, 1])) < STEP * spread.max() or not spread.any():
         return 1.0  # all of one axis, then all of the next
     return max(_most_apart([rows[k::turn, axis] for k in range(turn)]) for axis in (0, 1) for turn in range(2, 9))
 

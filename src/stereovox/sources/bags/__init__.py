@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stereovox.errors import SourceError
 from stereovox.sources.bags.files import BagFile
+from stereovox.sources.foreign_files import POINTS, is_pointer
 
 MAGIC = {b"#ROSBAG V": ".bag", b"SQLite fo": ".db3", b"\x89MCAP0\r\n\1": ".mcap"}
 FOLDER = "folder"
@@ -47,6 +48,8 @@ def open_bag(path: Path) -> BagFile:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     if not start:
         raise SourceError(f"{path}: the file is empty; record or copy it again")
+    if is_pointer(path):
+        raise SourceError(f"{path}: {POINTS}")
     if start not in MAGIC:
         what = "neither a ROS 1 bag (version 2.0) nor a .db3 or .mcap recording"
         raise SourceError(f"{path}: {what}, whatever its name says")

@@ -192,6 +192,10 @@ def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) 
     fx, _, cx, _, fy, cy = info.K[:6]
     if rectified and info.P[0] > 0:
         fx, cx, fy, cy = info.P[0], info.P[2], info.P[5], info.P[6]
+    if not (fx > 0 and fy > 0):
+        raise SourceError(
+            "has no focal length (K is zero: the camera was not calibrated); name another with ?info=/topic"
+        )
     if info.width * info.height > MAX_PIXELS:
         raise SourceError(f"has {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
     return PinholeCamera(info.width, info.height, fx, fy, cx, cy, baseline)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import MAX_PIXELS
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.files.safe_io import read_bounded
+from stereovox.sources.foreign_files import POINTER, POINTS
 from stereovox.sources.images import GREY_16, MAX_BYTES, SIGNATURE, decode_png, size_text, spread
 
 SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
@@ -103,6 +104,8 @@ def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None
     for start, decode in DECODERS.items():
         if content.startswith(start):
             return _depth(path, decode(path, content))
+    if content.startswith(POINTER):
+        raise FrameRefused("unreadable", f"{path}: {POINTS}")
     raise FrameRefused("unreadable", f"{path}: not a depth image of a known kind ({', '.join(SUFFIXES)})")
 
 

@@ -156,7 +156,7 @@ def _is_stamped(folder: Path) -> bool:
         return True
     try:
         names = sorted(name for name in os.listdir(folder / IMAGES) if name.lower().endswith(SUFFIXES))
-    except OSError:
+    except (OSError, ValueError):
         return False
     return bool(names) and re.fullmatch(r"\d+\.\d{3,}", os.path.splitext(names[0])[0]) is not None
 

@@ -43,9 +43,12 @@ class ProjectiveConfig(Section):
 
     full_share: a hit counts in full if at least this share of the cell's footprint in the image measures the cell; a
         smaller share counts as its square root, since a few pixels may be wrong; 0: every hit counts in full.
+    edge_share: a cell that is seen through, but has something nearer within an area about twice as wide, loses only
+        this share of the usual evidence: at edges depths are often wrong. 1: as much as elsewhere.
     """
 
     full_share: float = Field(0.0, ge=0, le=1)
+    edge_share: float = Field(1.0, gt=0, le=1)
 
 
 class MapConfig(Section):

@@ -85,6 +85,7 @@ class KernelTable(NamedTuple):
     mark: NDArray[np.int32]  # (rows, columns) positive evidence next to the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
     passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is seen through; negative
+    edged: NDArray[np.int32]  # (rows,) the same next to an edge
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns per metre
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
     safe: NDArray[np.float32]  # (rows + 1,) nearest z that is not plainly free for some later row
@@ -133,14 +134,18 @@ def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCame
     """Return the kernel table of a sensor model for a camera with the configured noise, or a lidar with its own."""
     noise = RangeNoise.of(config.noise, camera)
     table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
-    return kernel_table(table, config.max_range, config.blind)
+    return kernel_table(table, config.max_range, config.blind, config.projective.edge_share)
 
 
-def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> KernelTable:
-    """Return `table` in the form that kernels read; up to depth `blind` in metres nothing is cleared."""
+def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0, edge_share: float = 1.0) -> KernelTable:
+    """Return `table` in the form that kernels read; up to depth `blind` in metres nothing is cleared.
+
+    edge_share: see `ProjectiveConfig`.
+    """
     units = to_units(table.log_odds)
     clear, mark = np.minimum(units, 0), np.maximum(units, 0)
     free = int(units[0, 0])
+    passed = np.maximum(to_units(table.passed), free)
     reach = REACH_SIGMA * table.sigma
     edges = np.arange(len(reach)) / table.rows_per_metre
     safe = np.append(np.minimum.accumulate((edges - reach)[::-1])[::-1], max_range)
@@ -148,7 +153,8 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> Ke
         clear,
         mark,
         to_units(table.hit),
-        np.maximum(to_units(table.passed), free),
+        passed,
+        np.floor(edge_share * passed).astype(np.int32),
         (COLUMNS / (2 * reach)).astype(np.float32),
         reach.astype(np.float32),
         safe.astype(np.float32),

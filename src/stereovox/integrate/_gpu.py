@@ -114,8 +114,8 @@ def widen_clear(base, windows, table):
 
 
 @gpu_kernel
-def fill_tiles(windows):
-    """Fill the tiles of 16 pixels of all levels from `windows.first` on."""
+def fill_tiles(windows, edges):
+    """Fill the tiles of 16 pixels of all levels from `windows.first` on; edges: whether there are clear depths."""
     for level in range(windows.first, COARSEST + 1):
         rows, columns = windows.shape[level, 0], windows.shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, windows.pitch, windows.height)
@@ -126,7 +126,8 @@ def fill_tiles(windows):
             for line in range(v, min(v + 16, rows)):
                 for column in range(u, min(u + 16, columns)):
                     at = start + line * windows.pitch + column
-                    nearest, farthest = min(nearest, windows.clear[at]), max(farthest, windows.image[at])
+                    least = windows.clear[at] if edges else windows.image[at]
+                    nearest, farthest = min(nearest, least), max(farthest, windows.image[at])
             windows.lows[offset + i], windows.highs[offset + i] = nearest, farthest
 
 
@@ -351,7 +352,7 @@ def evaluate(depth_m, view, table, windows, origin, mixed, hit_of, hits, counts,
             row = measured_row(view, table, measured)
             at = table_place(table, row, z - measured, table.columns_per_metre[row])
             value = cleared(table.clear[at // table.clear.shape[1], at % table.clear.shape[1]], at_edge, measured)
-            value = np.int16(lowest) if z < windows.clear[window] else value
+            value = np.int16(lowest) if table.edges and z < windows.clear[window] else value
             if table.marks:
                 mark = marked(depth_m, view, table, cx, cy, cz, c)
                 value = np.int16(mark) if mark > 0 else value

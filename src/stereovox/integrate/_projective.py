@@ -246,6 +246,8 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     closest = NO_RETURN
     for level in range(finest, coarsest + 1):
         closest = min(closest, _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False))
+    if not table.edges:
+        closest = clear_to(table, closest)
     if table.marks:
         closest = min(closest, clear_to(table, _nearest(nearest, tile, u0, u1, v0, v1)))
     return FREE if z_high < closest * (ONE - SLACK) else MIXED
@@ -334,7 +336,10 @@ def _clear(view, table, windows, cx, cy, cz, scratch, out):
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _aim(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, at)
         _load(windows.image, at, measured)
-        _load(windows.clear, at, clear)
+        if table.edges:
+            _load(windows.clear, at, clear)
+        else:
+            clear[:] = UNSEEN
         if _write_free_layer(depths, measured, clear, before, table.behind, lowest, at_edge, out[cells]):
             _look_up(view, table, scratch, at_edge, out[cells])
 

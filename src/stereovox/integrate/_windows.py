@@ -6,8 +6,8 @@ around it. One sees through a tile as far as its nearest pixel (`_shrink`). Next
 wrong and thin things are missed, so cells larger than about four pixels are cleared only by patches that see through as
 a whole, smaller ones by single pixels. A second image of the same layout, `clear`, holds up to which depth an area
 about twice as wide, the 3x3 tiles of the next level, is plainly free as a whole: a cell that is seen through but lies
-farther is next to an edge. For fast culling each level also has the least clear and the farthest window value of tiles
-of 16 and 64 of its own pixels. A missing value is 0: the nearest of all, which never clears
+farther is next to an edge. It is left out if `edge_share` is 1. For fast culling each level also has the least clear
+depth, or window value, and the farthest window value of tiles of 16 and 64 of its own pixels. A missing value is 0: the nearest of all, which never clears
 anything.
 
 All levels share one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side below
@@ -62,13 +62,17 @@ def build(depth_m, windows, table, scratch):
                 _copy(here, columns, out)
             else:
                 _farthest_of_three(above, here, below, columns, row, out)
-            if not has_finer(level):
+            if not table.edges:
+                clear = out
+            elif not has_finer(level):
                 _clear_of_three(above, here, below, columns, table, row, clear)
+                _not_through(out, columns, clear)
             else:
                 if v % 2 == 0:
                     above, here, below = _three_rows(base, shape, pitch, level + 1, v >> 1)
                     _clear_of_three(above, here, below, shape[level + 1, 1], table, row, other)
                 _doubled(other, columns, clear)
+                _not_through(out, columns, clear)
             _take_in(out, clear, columns, v, high_row, low_row)
             if v % 16 == 15 or v == rows - 1:
                 offsets = tile_offset[level, 0] + (v >> 4) * tile_width[level, 0]
@@ -200,6 +204,13 @@ def _clear_of_three(above, here, below, width, table, row, out):
 
 
 @cell
+def _not_through(line, width, clear):
+    """Make nothing clear through windows without value."""
+    for u in range(width):
+        clear[u] = clear[u] if line[u] > ZERO else ZERO
+
+
+@cell
 def clear_to(table, depth):
     """Return the z up to which every measurement of at least `depth` gives plain free space."""
     if depth <= ZERO:
@@ -212,12 +223,7 @@ def clear_to(table, depth):
 
 @cell
 def _take_in(line, clear, width, v, high_row, low_row):
-    """Merge row v into the maxima of up to 16 rows, of the window values and of the negatives of the clear depths.
-
-    Nothing is clear through a window without value.
-    """
-    for u in range(width):
-        clear[u] = clear[u] if line[u] > ZERO else ZERO
+    """Merge row v into the maxima of up to 16 rows, of the window values and of the negatives of the clear depths."""
     if v % 16 == 0:
         for u in range(width):
             high_row[u] = line[u]

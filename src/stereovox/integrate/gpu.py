@@ -169,8 +169,9 @@ class GpuWindows:
         for level in self._levels:
             launch(_gpu.shrink, depth_m, self._base, self.on_gpu, level)
         launch(_gpu.widen, self._base, self.on_gpu)
-        launch(_gpu.widen_clear, self._base, self.on_gpu, table)
-        launch(_gpu.fill_tiles, self.on_gpu)
+        if table.edges:
+            launch(_gpu.widen_clear, self._base, self.on_gpu, table)
+        launch(_gpu.fill_tiles, self.on_gpu, table.edges)
         launch(_gpu.join_tiles, self.on_gpu)
         if self._marks:
             for size, tiles in zip((16, 64), self.nearest, strict=True):

@@ -95,6 +95,7 @@ class KernelTable(NamedTuple):
     blind: np.float32  # depth in metres up to which nothing is cleared
     free: np.int32  # evidence far before a measurement, if `passed` allows it
     marks: bool  # whether there is any positive evidence next to the hit
+    edges: bool  # whether cells next to an edge lose less than others
 
 
 class Rays(NamedTuple):
@@ -164,6 +165,7 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0, edge_
         np.float32(blind),
         np.int32(free),
         bool((mark > 0).any()),
+        edge_share < 1,
     )
 
 

@@ -7,11 +7,10 @@ wrong and thin things are missed, so cells larger than about four pixels are cle
 a whole, smaller ones by single pixels. A second image of the same layout, `clear`, holds up to which depth an area
 about twice as wide, the 3x3 tiles of the next level, is plainly free as a whole: a cell that is seen through but lies
 farther is next to an edge. It is left out if `edge_share` is 1. For fast culling each level also has the least clear
-depth, or window value, and the farthest window value of tiles of 16 and 64 of its own pixels. A missing value is 0: the nearest of all, which never clears
-anything.
-
-All levels share one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side below
-that; so the index of a pixel takes a few sums and no table look-up (`place`).
+depth, or window value, and the farthest window value of tiles of 16 and 64 of its own pixels. A missing value is 0: the
+nearest of all, which never clears anything. All levels share one image whose rows are `pitch` long: level 1 on top,
+level 0 below it, the others side by side below that; so the index of a pixel takes a few sums and no table look-up
+(`place`).
 """
 
 import numpy as np
@@ -105,7 +104,8 @@ def _shrink(depth_m, shape, base, pitch, near, known):
     """Write how far one sees through each tile of the levels from 1 on to `base`, laid out like the window images.
 
     A tile has four parts, of the previous level: one sees through it as far as its nearest value, and not at all
-    (`seen_through`) if most parts have none. At the border tiles end with the image: its last row and column count twice.
+    (`seen_through`) if most parts have none. At the border tiles end with the image: its last row and column count
+    twice.
     near, known: (pitch,) scratch.
     """
     height = shape[0, 0]

@@ -27,12 +27,13 @@ from stereovox.mapping.deadline import Deadline, Levels
 from stereovox.mapping.floor_comparison import FloorComparison
 from stereovox.mapping.gate import GateResult
 from stereovox.mapping.intake import Aged, Intake
-from stereovox.mapping.rebuild import CorrectionReport, FramePoses, correct
+from stereovox.mapping.rebuild import CorrectionReport, FramePoses, begin_anew, correct
 from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.record.health import Health
+from stereovox.maps.record.history import TRIES
 from stereovox.maps.record.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 
 SeenT = TypeVar("SeenT", contravariant=True)
@@ -141,6 +142,8 @@ class Mapper(Aged):
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = Comparison(self.config, self._intake.gate)
+        if resume is None and self.config.trust.max_disagreement < 1:
+            self.map.history.unconfirmed = TRIES
 
     def add(self, frame: AnyFrame) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
@@ -164,6 +167,8 @@ class Mapper(Aged):
             packed = self._packed(depth_frame, passed)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
+                if passed.takes_out:
+                    begin_anew(self.map.storage, self._tiles)
                 self.map.storage.set_viewpoint(image.viewpoint)
                 cells = self.map.add(evidence)
                 self._keep(depth_frame, packed, passed, quality.name, evidence)
@@ -172,7 +177,7 @@ class Mapper(Aged):
                 self.map.history.path.walk(passed.sensor, passed.seen)
             map_ms = 1e3 * (perf_counter() - prepared)
             offer.report = UpdateReport(
-                depth_ms, map_ms, cells, detail=passed.note, match_ms=match_ms, quality=quality.name
+                depth_ms, map_ms, cells, None, passed.note, match_ms, quality.name, passed.takes_out
             )
             self._deadline.record(match_ms + depth_ms + map_ms)
             self._deadline.warm_up(frame, depth_frame.camera)

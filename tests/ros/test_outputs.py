@@ -50,3 +50,23 @@ def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
     assert len(publishers["/diagnostics"].sent) in (2, 3)
     outputs.close()
     assert publishers[MAP].sent[-1].header.stamp.nanosec == 59
+
+
+def test_a_map_that_no_second_frame_has_confirmed_is_not_published(monkeypatch):
+    publishers: dict[str, Publisher] = {}
+    node = SimpleNamespace(
+        create_publisher=lambda kind, topic, qos: publishers.setdefault(topic, Publisher()),
+        get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=0)),
+        get_fully_qualified_name=lambda: "/stereovox",
+        get_logger=lambda: SimpleNamespace(info=print),
+    )
+    health = SimpleNamespace(state="waiting", text="waiting", as_dict=dict)
+    grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.1)
+    mapping = SimpleNamespace(config=load_config(), grid=lambda: grid, health=lambda: health, snapshot=lambda: None)
+    outputs = Outputs(node, mapping, Options(), dict, lambda: 100.0)
+    outputs.changed(1, "map")
+    outputs.update()
+    assert not publishers[MAP].sent
+    health.state = "current"
+    outputs.update()
+    assert len(publishers[MAP].sent) == 1

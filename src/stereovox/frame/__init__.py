@@ -44,6 +44,8 @@ class UpdateReport:
         detail: The refusal in one line, or a note that frames of this sensor are accepted again.
         match_ms: Milliseconds to rectify and match a stereo pair; 0 for other frames.
         quality: Quality level of the frame: `full`, or `near` or `coarse` where `deadline_ms` left less time.
+        taken_out: Number of earlier frames taken out of the map again, because the frame contradicts them and no other
+            had confirmed them.
     """
 
     depth_ms: float = 0.0
@@ -53,6 +55,7 @@ class UpdateReport:
     detail: str = ""
     match_ms: float = 0.0
     quality: str = "full"
+    taken_out: int = 0
 
 
 class Reason(IntEnum):

@@ -183,6 +183,7 @@ ELSEWHERE = {
     "no_camera": "ROS 2: no camera info was received",
     "tracking_lost": "tracking: the camera's pose is unknown",
     "no_photo": "tracking: a depth image has no color image taken with it",
+    "unconfirmed": "first frames of a map that the next one contradicts; they are taken out again",
     "not_in_order": "SLAM and localisation: not later than the previous scan",
 }
 """Reasons that sources, trackers and localisation give as the `fault` of a frame, which is then refused."""

@@ -48,6 +48,8 @@ class GateResult(NamedTuple):
 
     after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None if `trust.frozen` is
     off. agreement: how it agrees with the map, None if they were not compared. glances: those to keep for its sensor.
+    confirms: whether it is the first to agree with the map. takes_out: number of frames before it, none of which has
+    been confirmed, and which it contradicts: the map begins anew with it.
     """
 
     sensor: str
@@ -56,10 +58,14 @@ class GateResult(NamedTuple):
     look: ImageFingerprint | None = None
     agreement: Agreement | None = None
     glances: tuple[Glance, ...] = ()
+    confirms: bool = False
+    takes_out: int = 0
 
     @property
     def note(self) -> str:
         """Line for the report, "" if there is nothing to report."""
+        if self.takes_out:
+            return "the map begins anew: the frames before contradict this one, and none had been confirmed"
         return f"frames of '{self.sensor}' are accepted again after {self.after}" if self.after else ""
 
 
@@ -133,6 +139,8 @@ class Gate:
             self._history.glances[passed.sensor] = passed.glances
         if passed.agreement is not None:
             self._monitor.accept(passed.sensor, passed.agreement)
+        if passed.confirms:
+            self._history.unconfirmed = 0
         if passed.after:
             self._history.settled[passed.after] += 1
 

@@ -50,6 +50,11 @@ class Intake:
         self._map.lock.refuse_holder()
         return PendingFrame(self, frame, arrived_ns)
 
+    @property
+    def is_provisional(self) -> bool:
+        """Whether no two frames of the map have agreed yet."""
+        return self._map.history.is_provisional
+
     def closed(self) -> AbstractContextManager[object]:
         """Return a context that lets no frame in while it is entered."""
         return self._adding
@@ -69,7 +74,8 @@ class Aged:
         Returns:
             State, age and recent refusals of the map.
         """
-        return self._intake.monitor.health(now_ns)
+        intake = self._intake
+        return intake.monitor.health(now_ns, intake.is_provisional)
 
     @property
     def stamp_clock(self) -> StampsBy:

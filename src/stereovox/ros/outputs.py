@@ -194,7 +194,7 @@ class Outputs:
         if health.state in STALE:
             text = f"the map is not published, since it is {health.text}"
             self._node.get_logger().error(text, throttle_duration_sec=10.0)
-        return health.state not in STALE
+        return health.state not in (*STALE, "waiting")
 
     def _publish_map(self, now: float) -> None:
         self._new_map = self._corrected = False

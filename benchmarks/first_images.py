@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 import stereovox as sv
+from stereovox.frame import CheckedCloud
 from stereovox.simulate.surround import Surround
 from stereovox_lab.checks.bad_images import _bad_depths, _bad_pairs
 from stereovox_lab.checks.lasting import FAULTS, Bad, Walk, _always
@@ -69,8 +70,7 @@ def free(mapper: sv.Mapper, good: list[Any], wanted: argparse.Namespace) -> floa
     for frame in good:
         control.add(frame)
         image = control._deadline.quality().prepare(frame)[1]
-        depths = getattr(image, "depth_m", None)
-        seen = image.ends[image.hits] if depths is None else _points(image)
+        seen = image.ends[image.hits] if isinstance(image, CheckedCloud) else _points(image)
         points.append(seen @ image.T_world_sensor[:3, :3].T + image.T_world_sensor[:3, 3])
     there = np.concatenate(points)
     mine, theirs = (one.map.state(there) == sv.State.FREE for one in (mapper, control))
@@ -84,7 +84,7 @@ def _points(image: Any) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", default="0:20", help="a Python slice; the constants were chosen on 100:106")
     parser.add_argument("--hz", type=float, default=10.0)
     parser.add_argument("--voxel-size", type=float, default=0.1)

@@ -39,8 +39,8 @@ def mapped(frames, **settings):
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_a_bad_first_frame_is_taken_out_by_the_second(walk, kind):
-    if kind == "upside down" and isinstance(walk[0][0], sv.Cloud):
-        pytest.skip("a lidar sees nearly the same upside down")
+    if kind in ("upside down", "plane at 1 m") and isinstance(walk[0][0], sv.Cloud):
+        pytest.skip("a lidar sees nearly the same upside down; what is too near says nothing wrong of free space")
     mapper, (first, second, third) = mapped([spoilt(walk, kind), *walk[0][1:3]])
     assert (first.refused, second.refused, third.refused) == (None, None, None)
     assert (second.taken_out, third.taken_out) == (1, 0)

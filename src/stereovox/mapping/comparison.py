@@ -33,9 +33,11 @@ FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
 """Most points of a frame in doubt that a glance keeps, that are looked up in the map, and that faults are tried on."""
-CONFIRMED, OVERLAP, SLIGHT = 0.85, 0.25, 0.1
-"""The first frames count once another agrees with the map in this share of its points on known cells, if these are at
-least OVERLAP of all; with fewer, from SLIGHT on, it can only contradict them."""
+CONFIRMED, CONTRADICTED = 0.85, 0.7
+"""The first frames count once another agrees with the map in this share of its points on known cells; below the second
+they are taken out, and between both if most is known: from elsewhere, good frames agree less."""
+OVERLAP, MOST = 0.25, 0.5
+"""Share of a frame's points that must be known for a judgement, and to count as most."""
 GAIN = 0.1
 """Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
@@ -124,11 +126,11 @@ class Comparison:
         with voxel_map.lock:
             placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance), voxel_map.history.frames
         agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
-        if known < max(FEW, SLIGHT * len(points)):
+        if known < max(FEW, OVERLAP * len(points)):
             return passed
-        if agree < CONFIRMED * known:
+        if agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
             return passed._replace(takes_out=frames, glances=())
-        return passed._replace(confirms=known >= OVERLAP * len(points))
+        return passed._replace(confirms=agree >= CONFIRMED * known)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Inspect the first image, so that kernels compile now and not when a frame is in doubt."""

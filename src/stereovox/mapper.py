@@ -7,6 +7,7 @@ Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
@@ -15,7 +16,7 @@ from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import ConfigError, MapFileError
-from stereovox.frame import AnyFrame, Cloud, Frame, Scan
+from stereovox.frame import AnyFrame, Cloud, Frame, Range, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.validate import validate_upright_scan
@@ -103,7 +104,7 @@ class AnyMapper(Protocol[SeenT]):
 
 
 class Mapper(Aged):
-    """Builds a voxel map from depth images, stereo pairs or clouds of lidars.
+    """Builds a voxel map from depth images, stereo pairs, clouds of lidars or distances of sonars.
 
     A frame that cannot be trusted is refused and changes nothing but the count of refusals.
 
@@ -145,11 +146,11 @@ class Mapper(Aged):
         if resume is None and self.config.trust.max_disagreement < 1:
             self.map.history.unconfirmed = TRIES
 
-    def add(self, frame: AnyFrame) -> UpdateReport:
+    def add(self, frame: AnyFrame | Range) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
         Args:
-            frame: Depth image, stereo pair or cloud, with the pose it was taken at.
+            frame: Depth image, stereo pair, cloud or range, with the pose it was taken at.
 
         Returns:
             What the frame changed and how long each step took, or why it was refused.
@@ -163,6 +164,8 @@ class Mapper(Aged):
             prepared = perf_counter()
             passed = offer.check(image)
             evidence = quality.integrator.evidence(image)
+            if passed.repeats:
+                evidence = replace(evidence, again=True)
             passed = self._comparison.check(frame, image, evidence, passed, self.map)
             packed = self._packed(depth_frame, passed)
             with self.map.lock, uninterrupted():
@@ -208,7 +211,7 @@ class Mapper(Aged):
         with self._correcting:
             return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
-    def expect(self, frame: AnyFrame) -> None:
+    def expect(self, frame: AnyFrame | Range) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.
 
         Call it before `add` of the frame before; the map is the same without. Nothing happens with one thread
@@ -245,7 +248,8 @@ class Mapper(Aged):
     def _packed(self, frame: Frame | Cloud, passed: GateResult) -> Packed | PackedCloud | None:
         """Return the frame's depth image or cloud to be kept; None if it is not."""
         kept = self.map.storage.kept
-        return packed_of(frame) if kept is not None and kept.wants(passed.sensor, passed.seen) else None
+        wanted = kept is not None and not passed.repeats and kept.wants(passed.sensor, passed.seen)
+        return packed_of(frame) if wanted else None
 
     def _keep(
         self,

@@ -10,10 +10,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
+from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage, Range
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
@@ -96,14 +96,14 @@ class Comparison:
         self._prepared = False
 
     def check(
-        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
+        self, frame: AnyFrame | Range, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
     ) -> GateResult:
-        """Return what the gate needs to accept the frame.
+        """Return what the gate needs to accept the frame; a cone is not compared, for it yields to the map.
 
         evidence: the evidence of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
         `Gate.check_agreement`; not while the map is provisional, for either may be wrong: it then begins anew.
         """
-        if not self._compares:
+        if not self._compares or isinstance(image.camera, RangeSensor):
             return passed
         self._prepare(voxel_map, image)
         if voxel_map.history.is_provisional:

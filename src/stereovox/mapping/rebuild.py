@@ -332,8 +332,9 @@ class Rebuild:
             return evidence
         mixed, free = (_is_in(self._dirty, coords) for coords in (evidence.coords, evidence.uniform))
         return Evidence(
-            evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free]
-        )
+            evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free],
+            evidence.weak,
+        )  # fmt: skip
 
     def _check_room(self, evidence: Evidence) -> None:
         try:

@@ -196,6 +196,8 @@ def timed_forms():
         "Newer College": ("#sec,nsec,x,y,z,qx,qy,qz,qw", ",", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
         "the same without a heading": ("", " ", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
         "VINS": ("", ",", [[t, *w, *zero, ""] for t, _, w in both]),
+        "VINS after loops": ("", ",", [[t, *w, ""] for t, _, w in both]),
+        "TUM with commas": ("", ",", [[t, *q] for t, q in zip(seconds, xyzw, strict=True)]),
         "MulRan": ("", ",", [[t, *m] for t, m in zip(ns, matrices, strict=True)]),
         "ARKit": ("", " ", [[t, *v] for t, v in zip(seconds, vectors, strict=True)]),
         "TUM in nanoseconds": ("", " ", [[t, *q] for t, q, _ in both]),

@@ -12,7 +12,7 @@
 | JSON | a PinholeCameraTrajectory (world to camera, which is inverted) | Open3D |
 | NumPy | `.npy` of (N, 4, 4), (N, 16), (N, 12) or (N, 7) numbers | scripts |
 | named columns | a time, positions and quaternions, named in a heading | EuRoC, AirSim, `rostopic -p`, OpenVINS |
-| VINS | `stamp tx ty tz qw qx qy qz vx vy vz` | VINS-Mono, VINS-Fusion |
+| VINS | `stamp tx ty tz qw qx qy qz vx vy vz`, or without `v` if each line ends with a comma | VINS-Mono, VINS-Fusion |
 | numbered | a number or a time in nanoseconds, then 12 or 16 numbers | KITTI-360, MulRan |
 | split time | `sec nsec tx ty tz qx qy qz qw` | Newer College |
 | ARKit | `stamp rx ry rz tx ty tz`, world to camera (inverted) | ARKitScenes |
@@ -120,14 +120,14 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         and any(row[1] > LARGEST_CONFIDENCE for row in rows)
     ):
         return _over_time(path, [(int(row[0]) * SECOND + int(row[1]), row[2:]) for row in rows])
+    if widths == {11} or (widths == {8} and _ends_with_commas(path)):
+        return _over_time(
+            path, [(ns_from_stamp(words[0]), _numbers(words[1:4] + words[5:8] + words[4:5])) for words in _words(path)]
+        )
     if widths and widths <= {8, 9}:  # the ninth: a tracker's confidence
         return Trajectory(path)
     if widths in ({13}, {17}):
         return _numbered(path)
-    if widths == {11}:
-        return _over_time(
-            path, [(ns_from_stamp(words[0]), _numbers(words[1:4] + words[5:8] + words[4:5])) for words in _words(path)]
-        )
     if widths == {7} and _is_arkit(rows):
         found = [(ns_from_stamp(words[0]), _numbers(words[1:])) for words in _words(path)]
         return _over_time(path, [(stamp, _of_rotation_vector(numbers)) for stamp, numbers in found])
@@ -218,6 +218,12 @@ def _words(path: Path) -> list[list[str]]:
     """Return the words of all lines that begin with a number."""
     lines = (_plain(line) for line in read_text(path, MAX_LIST, "replace").splitlines())
     return [words for words in lines if words and not re.match("[a-zA-Z]", words[0])]
+
+
+def _ends_with_commas(path: Path) -> bool:
+    """Return whether all lines with numbers end with a comma, as VINS writes them; nobody writes the TUM form so."""
+    lines = [line.partition("#")[0].strip() for line in read_text(path, MAX_LIST, "replace").splitlines()]
+    return all(line.endswith(",") for line in lines if line)
 
 
 def _numbers(words: Sequence[str]) -> list[float]:

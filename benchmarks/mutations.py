@@ -146,7 +146,7 @@ def outputs() -> list[Mutation]:
             "mavlink/sending.py",
             "        if age_s > self._max_age_s:",
             "        if False:",
-            CONTEXT,
+            "tests/mavlink/test_sending.py,tests/mavlink/test_late.py",
         ),
         Mutation(
             "ObstacleSender age of the pose",

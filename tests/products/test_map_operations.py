@@ -55,6 +55,19 @@ def test_crop_keeps_the_cells_whose_middle_is_inside(kind):
     assert 0 < len(part) < len(table(voxel_map))
 
 
+def test_a_crop_keeps_up_and_how_old_its_frames_are():
+    mapper = Mapper(load_config(voxel_size=0.1, up="-y"))
+    source = sv.open_source("sim:room?axes=optical", frames=":2")
+    for frame in source:
+        assert mapper.add(frame).refused is None
+    whole = mapper.map
+    part = sv.crop(whole, [-1, -1, 0], [1, 1, 2])
+    assert part.config == whole.config
+    assert part.history.frames == whole.history.frames == 2
+    np.testing.assert_array_equal(part.path, whole.path)
+    assert part.history.last_frame == whole.history.last_frame is not None
+
+
 def test_crops_that_share_a_face_make_the_whole():
     voxel_map = random_map()
     low, high = (sv.crop(voxel_map, *box) for box in (([-math.inf] * 3, [0.33, math.inf, math.inf]),

@@ -9,9 +9,10 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
 
 from stereovox.config import load_config
+from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.options import Options
-from stereovox.ros.outputs import MAP, Outputs
+from stereovox.ros.outputs import MAP, Outputs, cloud_message, occupancy_message
 
 
 class Publisher:
@@ -50,3 +51,14 @@ def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
     assert len(publishers["/diagnostics"].sent) in (2, 3)
     outputs.close()
     assert publishers[MAP].sent[-1].header.stamp.nanosec == 59
+
+
+def test_messages_carry_frame_and_time_and_clouds_only_occupied_cells():
+    cells, log_odds = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 9, 9]], [3.0, -3.0, 0.1, 3.0]  # the third is tentative
+    cloud = cloud_message(VoxelMap.from_cells(load_config(voxel_size=0.1), cells, np.array(log_odds)), 7, "world")
+    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(-1, 4)
+    np.testing.assert_allclose(sorted(points[:, 0]), [0.05, 0.95], atol=1e-6)
+    np.testing.assert_allclose(points[:, 3], 1 / (1 + np.exp(-3)), atol=1e-3)
+    grid = occupancy_message(OccupancyGrid(np.zeros((3, 4), np.int8), 0.1), 8, "hall")
+    for message, frame, stamp in ((cloud, "world", 7), (grid, "hall", 8)):
+        assert (message.header.frame_id, message.header.stamp.nanosec) == (frame, stamp)

@@ -22,8 +22,9 @@ ALIKE, APART = 0.35, 0.1
 """Largest difference (Kolmogorov and Smirnov's) between every n-th number of a column, and by how much any other layout
 must be worse. Consecutive numbers of one axis differ by less than `STEP` of their spread."""
 STEP = 0.02
-NEAR_M, LARGEST_M, SAMPLED = 2000.0, 1e9, 60_000
-"""Metres below which all coordinates of a lidar are, and below which floats can compute with them; points inspected."""
+NEAR, LARGEST_M, SAMPLED = 2e6, 1e9, 60_000
+"""Number below which all coordinates of a lidar are, even in millimetres, which `bad_units` reports; metres below which
+floats can compute with them; points inspected."""
 
 
 class BinLayout(NamedTuple):
@@ -152,11 +153,11 @@ def _repeats(one: BinLayout, other: BinLayout) -> bool:
 
 def _unlike(data: bytes, layout: BinLayout) -> float:
     """Return how much the numbers of x and y differ from one another, from one row in turn to the next; 1 if these are
-    no coordinates in metres.
+    no coordinates.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         rows = np.frombuffer(data, layout.dtype).reshape(-1, layout.columns)[:SAMPLED].astype(np.float64)
-        near = (np.abs(rows[:, :3]) < NEAR_M) & ((np.abs(rows[:, :3]) > 1e-6) | (rows[:, :3] == 0))
+        near = (np.abs(rows[:, :3]) < NEAR) & ((np.abs(rows[:, :3]) > 1e-6) | (rows[:, :3] == 0))
     if np.mean(near) < 0.99:
         return 1.0
     rows = rows[near.all(axis=1)]

@@ -238,3 +238,11 @@ def test_a_confidence_is_no_nanosecond_and_seven_numbers_are_a_quaternion(tmp_pa
     found = read_poses(tmp_path / "t.txt")
     assert isinstance(found, Poses)
     assert found.stamps_ns.tolist() == [500_000_000 + k * 10**9 for k in range(4)]
+
+
+@pytest.mark.parametrize("vertex", ["VERTEX_SE3:QUAT 1 0 0 0 0 0 1", "VERTEX_SE3:QUAT 1 0 0 zero 0 0 0 1"])
+def test_a_damaged_vertex_of_a_graph_is_not_left_out(tmp_path, vertex):
+    """The poses after it would be those of other images."""
+    (tmp_path / "graph.g2o").write_text(f"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n{vertex}\n")
+    with pytest.raises(SourceError, match="correct"):
+        read_poses(tmp_path / "graph.g2o")

@@ -151,8 +151,15 @@ def _by_names(path: Path) -> Poses | ImagePoses | None:
         return None  # reported by `_rows`
     graph = [line.split() for line in lines if line.startswith(G2O)]
     if graph:
-        poses = [_matrix(_numbers(words[2:]), f"{path}: vertex {words[1]}") for words in graph if len(words) == 9]
-        return ImagePoses(poses, str(path))
+        short = next((words for words in graph if len(words) != 9), None)
+        if short is not None:  # left out, it would shift the poses of all images after it
+            raise SourceError(f"{path}: '{' '.join(short[:3])} ...' is not '{G2O} id' and seven numbers; correct it")
+        try:
+            return ImagePoses(
+                [_matrix(_numbers(words[2:]), f"{path}: vertex {words[1]}") for words in graph], str(path)
+            )
+        except ValueError as error:
+            raise SourceError(f"{path}: {error}; correct the vertex") from None
     for heading in lines[:MAX_HEADING]:
         names = [_name(word) for word in _split(heading.lstrip("#% "))]
         columns = {key: k for k, name in reversed(list(enumerate(names))) if (key := _meaning(name))}

@@ -23,8 +23,8 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 606,
-    "lines": 92_550,
+    "modules": 609,
+    "lines": 92_650,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stereovox.cameras.lidar import Lidar as Lidar
+    from stereovox.cameras.lidar import RangeSensor as RangeSensor
     from stereovox.cameras.pinhole import PinholeCamera as PinholeCamera
     from stereovox.cameras.rigs import StereoPair as StereoPair
     from stereovox.cameras.wide import CylindricalCamera as CylindricalCamera
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Photo as Photo
+    from stereovox.frame import Range as Range
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
@@ -105,6 +107,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Lidar": "cameras.lidar",
+    "RangeSensor": "cameras.lidar",
     "PinholeCamera": "cameras.pinhole",
     "Config": "config",
     "load_config": "config",
@@ -113,6 +116,7 @@ _HOMES = {
     "DepthImage": "frame",
     "Frame": "frame",
     "Photo": "frame",
+    "Range": "frame",
     "Scan": "frame",
     "StereoFrame": "frame",
     "StereoPair": "cameras.rigs",

@@ -7,6 +7,7 @@ Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
@@ -15,7 +16,7 @@ from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.quality import checked_scan
 from stereovox.errors import ConfigError, MapFileError
-from stereovox.frame import AnyFrame, Cloud, Frame, Scan
+from stereovox.frame import AnyFrame, Cloud, Frame, Range, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.validate import validate_upright_scan
@@ -27,12 +28,13 @@ from stereovox.mapping.deadline import Deadline, Levels
 from stereovox.mapping.floor_comparison import FloorComparison
 from stereovox.mapping.gate import GateResult
 from stereovox.mapping.intake import Aged, Intake
-from stereovox.mapping.rebuild import CorrectionReport, FramePoses, correct
+from stereovox.mapping.rebuild import CorrectionReport, FramePoses, begin_anew, correct
 from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.record.health import Health
+from stereovox.maps.record.history import TRIES
 from stereovox.maps.record.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 
 SeenT = TypeVar("SeenT", contravariant=True)
@@ -102,7 +104,7 @@ class AnyMapper(Protocol[SeenT]):
 
 
 class Mapper(Aged):
-    """Builds a voxel map from depth images, stereo pairs or clouds of lidars.
+    """Builds a voxel map from depth images, stereo pairs, clouds of lidars or distances of sonars.
 
     A frame that cannot be trusted is refused and changes nothing but the count of refusals.
 
@@ -141,12 +143,14 @@ class Mapper(Aged):
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = Comparison(self.config, self._intake.gate)
+        if resume is None and self.config.trust.max_disagreement < 1:
+            self.map.history.unconfirmed = TRIES
 
-    def add(self, frame: AnyFrame) -> UpdateReport:
+    def add(self, frame: AnyFrame | Range) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
         Args:
-            frame: Depth image, stereo pair or cloud, with the pose it was taken at.
+            frame: Depth image, stereo pair, cloud or range, with the pose it was taken at.
 
         Returns:
             What the frame changed and how long each step took, or why it was refused.
@@ -160,10 +164,14 @@ class Mapper(Aged):
             prepared = perf_counter()
             passed = offer.check(image)
             evidence = quality.integrator.evidence(image)
+            if passed.repeats:
+                evidence = replace(evidence, again=True)
             passed = self._comparison.check(frame, image, evidence, passed, self.map)
             packed = self._packed(depth_frame, passed)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
+                if passed.takes_out:
+                    begin_anew(self.map.storage, self._tiles)
                 self.map.storage.set_viewpoint(image.viewpoint)
                 cells = self.map.add(evidence)
                 self._keep(depth_frame, packed, passed, quality.name, evidence)
@@ -172,7 +180,7 @@ class Mapper(Aged):
                 self.map.history.path.walk(passed.sensor, passed.seen)
             map_ms = 1e3 * (perf_counter() - prepared)
             offer.report = UpdateReport(
-                depth_ms, map_ms, cells, detail=passed.note, match_ms=match_ms, quality=quality.name
+                depth_ms, map_ms, cells, None, passed.note, match_ms, quality.name, passed.takes_out
             )
             self._deadline.record(match_ms + depth_ms + map_ms)
             self._deadline.warm_up(frame, depth_frame.camera)
@@ -203,7 +211,7 @@ class Mapper(Aged):
         with self._correcting:
             return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
-    def expect(self, frame: AnyFrame) -> None:
+    def expect(self, frame: AnyFrame | Range) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.
 
         Call it before `add` of the frame before; the map is the same without. Nothing happens with one thread
@@ -240,7 +248,8 @@ class Mapper(Aged):
     def _packed(self, frame: Frame | Cloud, passed: GateResult) -> Packed | PackedCloud | None:
         """Return the frame's depth image or cloud to be kept; None if it is not."""
         kept = self.map.storage.kept
-        return packed_of(frame) if kept is not None and kept.wants(passed.sensor, passed.seen) else None
+        wanted = kept is not None and not passed.repeats and kept.wants(passed.sensor, passed.seen)
+        return packed_of(frame) if wanted else None
 
     def _keep(
         self,

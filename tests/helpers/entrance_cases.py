@@ -16,14 +16,22 @@ from stereovox.frame import Reason, Scan, StereoFrame
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import look_at, rotation_matrix
 from stereovox.mapper import GridMapper
-from stereovox.mapping.entrance import CLOUD, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, SCAN
+from stereovox.mapping.entrance import CLOUD, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, RANGE, SCAN
 from stereovox.maps.record.history import DisagreementSpell
 
 CAMERA = sv.PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.1)
 WALL_M = 1.0
 SETTINGS: dict[str, Any] = {"voxel_size": 0.1, "max_range": 5.0, "stereo.disparities": 16}
 GRIDS = SCAN, IMAGE_SCAN, PAIR_SCAN
-MEASURED = {IMAGE: "depth", PAIR: "left", CLOUD: "points", SCAN: "ranges", IMAGE_SCAN: "depth", PAIR_SCAN: "left"}
+MEASURED = {
+    IMAGE: "depth",
+    PAIR: "left",
+    CLOUD: "points",
+    SCAN: "ranges",
+    IMAGE_SCAN: "depth",
+    PAIR_SCAN: "left",
+    RANGE: "distance",
+}
 LOOSE = {
     **{f"stereo.{name}": 0 for name in ("p1", "uniqueness", "speckle_size", "min_confidence", "texture", "left_right")},
     "stereo.p2": 0.01,
@@ -51,7 +59,15 @@ class Case:
 
 def good(kind: str, n: int = 0, **changes: Any) -> Any:
     """Return the n-th good input of a kind, with changed fields."""
-    made = {IMAGE: _image, PAIR: _pair, CLOUD: _cloud, SCAN: _scan, IMAGE_SCAN: _image, PAIR_SCAN: _pair}[kind](n)
+    made = {
+        IMAGE: _image,
+        PAIR: _pair,
+        CLOUD: _cloud,
+        SCAN: _scan,
+        IMAGE_SCAN: _image,
+        PAIR_SCAN: _pair,
+        RANGE: _range,
+    }[kind](n)
     return replace(made, **changes)
 
 
@@ -88,6 +104,11 @@ def _scan(n: int) -> Scan:
     ranges = walls + np.random.default_rng(n).normal(0, 0.003, 720)
     T = se2.lifted([0.002 * n, 0, 0])
     return Scan(ranges.astype(np.float32), -np.pi, np.pi / 360, 0.1, 10.0, T, stamp_ns=10**8 * n)
+
+
+def _range(n: int) -> sv.Range:
+    beam = sv.RangeSensor(beam=np.radians(20))
+    return sv.Range(0.95 + 0.001 * n, pose(0.002 * n), 10**8 * n, beam)
 
 
 def cases(reason: str, number: int, kind: str) -> list[Case]:
@@ -169,12 +190,14 @@ def _scaled(T: np.ndarray) -> np.ndarray:
 def _not_frames(kind: str) -> list[Case]:
     made, name = good(kind), MEASURED[kind]
     masked = replace(made, **{name: np.ma.masked_array(getattr(made, name))})
+    if kind == RANGE:
+        masked = replace(made, pose_sigma=(0.0, np.nan))
     more = [] if kind == SCAN else [Case(replace(made, pose_sigma=(-1.0, 0.0)))]
     return [Case("no frame"), Case(None), Case(masked), *more]
 
 
 def _wrong_mapper(kind: str) -> list[Case]:
-    mapper = GridMapper if kind == CLOUD else sv.Mapper
+    mapper = GridMapper if kind in (CLOUD, RANGE) else sv.Mapper
     return [Case(made, mapper=mapper) for made in (good(kind), good(kind, name=np.zeros(0)))]
 
 
@@ -208,7 +231,7 @@ def _huge_view(kind: str) -> list[Case]:
 
 
 def _too_large(kind: str) -> list[Case]:
-    if kind == CLOUD:
+    if kind in (CLOUD, RANGE):
         return [Case(good(kind), patch={"stereovox.integrate._cells.WIDE": 4})]
     far = _pair(0, 1) if kind == PAIR else good(kind, depth=np.full((48, 64), 4.0, np.float32))
     fine = {"voxel_size": 0.01, "depth.denoise": False}
@@ -231,6 +254,8 @@ def _unit(kind: str) -> list[Case]:
 
 
 def _nothing_left(kind: str) -> list[Case]:
+    if kind == RANGE:
+        return [Case(good(kind, distance=value)) for value in (np.nan, -np.inf, np.inf, 0.1, 4.1, 1500.0, -1.0)]
     if MEASURED[kind] == "left":
         return [Case(good(kind, left=np.full((48, 64), 128, np.uint8), right=np.full((48, 64), 128, np.uint8)))]
     made = getattr(good(kind), MEASURED[kind])

@@ -305,3 +305,38 @@ def _strongest(indices: NDArray, evidence: NDArray) -> Cells:
 def _known(cells: NDArray, evidence: NDArray) -> Cells:
     known = np.abs(evidence) >= 0.0005
     return cells[known], evidence[known]
+
+
+def cone(distance: float, T: NDArray, beam: float, sigma: float, config: Config) -> tuple[dict, dict, dict]:
+    """Return cells of a sonar's reading: surely before its arc, surely on it, and surely outside, by their evidence.
+
+    Each cell is judged by 8 x 8 x 8 points in it, without any ray; those that its edge or its noise cut are in none.
+    Of those far from all that, one in a hundred is looked at.
+    Moravec and Elfes 1985: the shares of all cells of the arc sum to 0.9 of one echo.
+    """
+    size, half, reach = np.array(config.cell), beam / 2, REACH_SIGMA * sigma
+    far = distance + 3 * size.max()
+    low, high = (np.floor((T[:3, 3] + sign * far) / size).astype(int) for sign in (-1, 1))
+    cells = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
+    middle = ((cells + 0.5) * size - T[:3, 3]) @ T[:3, :3]
+    length = np.linalg.norm(middle, axis=1)
+    near = (middle[:, 0] > np.cos(min(half + 0.3, np.pi)) * length) & (length < distance + 2 * size.max())
+    cells = cells[near | (np.arange(len(cells)) % 100 == 0)]
+    steps = np.stack(np.meshgrid(*3 * [np.linspace(0, 1, 8)], indexing="ij"), axis=-1).reshape(-1, 3)
+    before, arc, outside = {}, {}, {}
+    cap = 2 * np.pi * distance**2 * (1 - np.cos(half))
+    share = 0.9 / max(cap / config.voxel_size**2, 1.0)
+    for cell in cells:
+        points = ((cell + steps) * size - T[:3, 3]) @ T[:3, :3]
+        away = np.linalg.norm(points, axis=1)
+        angle = np.arctan2(np.linalg.norm(points[:, 1:], axis=1), points[:, 0])
+        gap = np.arcsin(np.minimum(size.min() / 2 / np.maximum(away, 1e-9), 1))
+        on_it = (np.abs(away - distance) < size.min() / 20) & (angle < half - gap)
+        key = tuple(cell.tolist())
+        if (angle < half - gap).all() and away.max() < distance - reach - size.max() and away.min() > config.blind:
+            before[key] = np.log(0.4 / 0.6)
+        elif on_it.sum() >= 30:
+            arc[key] = share
+        elif (angle > half).all() or away.min() > distance:
+            outside[key] = 0.0
+    return before, arc, outside

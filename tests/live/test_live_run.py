@@ -38,7 +38,7 @@ from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.poses import Poses
 from stereovox.track.tracker import Tracked
 
-SMALL = {"voxel_size": 0.1, "max_range": 4.0}
+SMALL = {"voxel_size": 0.1, "max_range": 4.0, "trust.max_disagreement": 1}  # its wall moves with the camera
 
 
 class Keeper:

@@ -52,6 +52,26 @@ def test_the_2d_map_is_written_while_it_grows_and_complete_at_the_end(tmp_path):
     assert (found.cells == 0).sum() > 50
 
 
+def test_nothing_is_written_of_a_map_that_no_second_frame_has_confirmed(tmp_path):
+    mapper, said = Mapper(**SETTINGS, **{"scan.floor": 0.0}), []
+    grid = GridFile(mapper, tmp_path / "g.yaml", (0.8, 1.2), period_s=0.0, notify=said.append)
+    sphere = LiveSphere(mapper.config, {"front": T_BODY_OPTICAL}, mapper=mapper)
+    written = []
+    for k in range(2):
+        report = mapper.add(frame(k))
+        for output in (grid, sphere):
+            output.after(frame(k), report)
+        if grid._busy is not None:
+            grid._busy.result()
+        written.append(grid.written)
+        if not k:
+            with pytest.raises(StereovoxError, match=r"waiting: .*no frame has confirmed"):
+                sphere.grid()
+    grid.close()
+    assert (written, said) == ([0, 1], [])
+    assert sphere.grid()
+
+
 @pytest.mark.parametrize("off_m", [0.0, -1.0, 1.0])
 def test_what_stands_on_the_true_floor_is_not_free_in_the_written_2d_map(tmp_path, monkeypatch, off_m):
     """The camera begins 1.3 m above the floor, at z = 0. A floor that is 1 m off fails the same test."""

@@ -59,6 +59,15 @@ def test_an_autopilot_reads_what_the_map_says(start_autopilot, mapped):
     assert (heartbeat["type"], heartbeat["autopilot"]) == (18, 8)  # onboard controller, no autopilot
 
 
+def test_nothing_is_sent_until_a_second_frame_agrees_with_the_first(start_autopilot, frames):
+    mapper = Mapper("default", voxel_size=0.1, clock=Clock())
+    with ObstacleSender(mapper, start_autopilot().url, rate_hz=None, rules=RULES) as sender:
+        sender.after(frames[0], mapper.add(frames[0]))
+        assert (sender.send(), sender.sent) == ("", 0)
+        sender.after(frames[1], mapper.add(frames[1]))
+        assert (sender.send(), sender.sent) == ("", 1)
+
+
 def test_the_rate_is_the_declared_one(start_autopilot, mapped):
     mapper, frame, report = mapped
     autopilot = start_autopilot()

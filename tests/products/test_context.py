@@ -377,6 +377,7 @@ def test_a_context_says_what_the_mapper_knows():
     assert (context.age_s, context.stamp_ns) == (pytest.approx(3.0), world.frames[-1][0].stamp_ns)
     assert context.stale.startswith("stale: ")
     assert context_of(World().mapper).stale == ""
+    assert context_of(World(frames=1).mapper).stale.startswith("waiting: ")
     assert context_of(World(tilt=0.3, frames=0).mapper).tilt_deg == pytest.approx(np.degrees(0.3))
 
 

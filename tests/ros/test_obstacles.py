@@ -119,7 +119,7 @@ def published():
 def test_nothing_is_published_while_one_of_several_sensors_is_silent(published, monkeypatch):
     sent, _, _, mapping, obstacles = published
     ages_s = {"front": 0.1, "back": 0.6}
-    monkeypatch.setattr(mapping, "health", lambda: SimpleNamespace(ages_s=ages_s))
+    monkeypatch.setattr(mapping, "health", lambda: SimpleNamespace(ages_s=ages_s, state="current"))
     obstacles.seen(1, "map", np.eye(4))
     obstacles.update()
     assert sent["obstacles"] == sent["free_rays"] == []
@@ -127,6 +127,15 @@ def test_nothing_is_published_while_one_of_several_sensors_is_silent(published, 
     ages_s["back"] = 0.4
     obstacles.update()
     assert len(sent["obstacles"]) == len(sent["free_rays"]) == 1
+
+
+def test_nothing_is_published_of_a_map_that_no_second_frame_has_confirmed(published, monkeypatch):
+    sent, _, _, mapping, obstacles = published
+    monkeypatch.setattr(mapping, "health", lambda: SimpleNamespace(ages_s={}, state="waiting", text="waiting: why"))
+    obstacles.seen(1, "map", np.eye(4))
+    obstacles.update()
+    assert sent["obstacles"] == sent["free_rays"] == []
+    assert "waiting: why" in obstacles.said[0]
 
 
 def test_clouds_have_one_stamp_and_frame_and_come_with_frames_alone(published):

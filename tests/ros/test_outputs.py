@@ -62,3 +62,23 @@ def test_messages_carry_frame_and_time_and_clouds_only_occupied_cells():
     grid = occupancy_message(OccupancyGrid(np.zeros((3, 4), np.int8), 0.1), 8, "hall")
     for message, frame, stamp in ((cloud, "world", 7), (grid, "hall", 8)):
         assert (message.header.frame_id, message.header.stamp.nanosec) == (frame, stamp)
+
+
+def test_a_map_that_no_second_frame_has_confirmed_is_not_published(monkeypatch):
+    publishers: dict[str, Publisher] = {}
+    node = SimpleNamespace(
+        create_publisher=lambda kind, topic, qos: publishers.setdefault(topic, Publisher()),
+        get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=0)),
+        get_fully_qualified_name=lambda: "/stereovox",
+        get_logger=lambda: SimpleNamespace(info=print),
+    )
+    health = SimpleNamespace(state="waiting", text="waiting", as_dict=dict)
+    grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.1)
+    mapping = SimpleNamespace(config=load_config(), grid=lambda: grid, health=lambda: health, snapshot=lambda: None)
+    outputs = Outputs(node, mapping, Options(), dict, lambda: 100.0)
+    outputs.changed(1, "map")
+    outputs.update()
+    assert not publishers[MAP].sent
+    health.state = "current"
+    outputs.update()
+    assert len(publishers[MAP].sent) == 1

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
+from math import cos, inf, pi, radians
 from typing import ClassVar
 
 from stereovox.errors import StereovoxError
@@ -46,3 +46,40 @@ class Lidar:
             raise StereovoxError(
                 f"lidar: ranges from {self.range_min:g} to {self.range_max:g} m; they must rise, from 0 on"
             )
+
+
+@dataclass(frozen=True)
+class RangeSensor(Lidar):
+    """A sensor that reports one distance, to the nearest thing in a cone: a sonar, a radar, a single wide beam.
+
+    Attributes:
+        sigma: As in `Lidar`.
+        range_min: Metres below which it measures nothing.
+        range_max: Metres up to which it measures.
+        beam: Full width of its cone in radians.
+        silence_clears: Whether its cone is free up to `range_max` if nothing is heard. Soft and oblique surfaces send
+            nothing back, so by default it is not.
+
+    Raises:
+        StereovoxError: A number is out of range.
+    """
+
+    sigma: float = 0.03
+    range_min: float = 0.2
+    range_max: float = 4.0
+    beam: float = radians(30)
+    silence_clears: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "beam", float(self.beam))
+        if not (0 < self.beam <= pi and self.range_max < inf):
+            raise StereovoxError(
+                f"range sensor: beam {self.beam:g}, range_max {self.range_max:g}: give the width of its cone in "
+                "radians, up to pi, and metres"
+            )
+
+    @property
+    def solid_angle(self) -> float:
+        """Steradians of its cone."""
+        return 2 * pi * (1 - cos(self.beam / 2))

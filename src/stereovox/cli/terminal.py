@@ -139,8 +139,8 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
         if doubt.get("kind") == "mostly_lost":
             say(f"warning: {doubt['text']}; the reasons:")
     for reason, number in result["refused"].items():
-        example = next(report.detail for report in reports if report.refused == reason)
-        say(f"  {number} x {reason}, first: {example}")
+        example = next((f", first: {report.detail}" for report in reports if report.refused == reason), "")
+        say(f"  {number} x {reason}{example}")
     for reason, number in result["settled"].items():
         say(f"  {number} x {reason}")
 

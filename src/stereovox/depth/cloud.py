@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.cameras.lidar import RangeSensor
 from stereovox.config import Config
 from stereovox.depth._cloud import usable
 from stereovox.depth.quality import check_cloud, check_unit_of_rays
@@ -55,7 +56,8 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     room = len(points) + len(clear)
     ends, starts, hits = np.empty((room, 3)), np.empty((room, 3)), np.zeros(room, bool)
     _check_unit(cloud, points, origins, clear, config)
-    nearest = max(cloud.lidar.range_min, config.min_range)
+    own = cloud.lidar.range_min  # `min_range` is that of cameras, which a sonar is used to look nearer than
+    nearest = own if isinstance(cloud.lidar, RangeSensor) else max(own, config.min_range)
     none = np.empty((0, 3)) if origins is None else origins
     farthest, reach = float(cloud.lidar.range_max), REACH_SIGMA * float(cloud.lidar.sigma)
     used, finite = usable(points, none, nearest, farthest, reach, ends, starts, hits)

@@ -12,6 +12,7 @@ import numpy as np
 from stereovox.frame import UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
+from stereovox.maps.record.history import UNCONFIRMED
 
 
 def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
@@ -25,8 +26,10 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
     """
     mapped = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)
+    if taken_out := sum(report.taken_out for report in mapped):
+        refused[UNCONFIRMED] += taken_out
     return {
-        "frames": len(mapped),
+        "frames": len(mapped) - taken_out,
         "frames_refused": refused.total(),
         "refused": dict(refused.most_common()),
         "settled": dict(Counter(report.detail for report in mapped if report.detail).most_common()),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair, VirtualCamera
 from stereovox.geometry.se2 import flattened
@@ -44,6 +44,8 @@ class UpdateReport:
         detail: The refusal in one line, or a note that frames of this sensor are accepted again.
         match_ms: Milliseconds to rectify and match a stereo pair; 0 for other frames.
         quality: Quality level of the frame: `full`, or `near` or `coarse` where `deadline_ms` left less time.
+        taken_out: Number of earlier frames taken out of the map again, because the frame contradicts them and no other
+            had confirmed them.
     """
 
     depth_ms: float = 0.0
@@ -53,6 +55,7 @@ class UpdateReport:
     detail: str = ""
     match_ms: float = 0.0
     quality: str = "full"
+    taken_out: int = 0
 
 
 class Reason(IntEnum):
@@ -282,13 +285,48 @@ class Cloud:
         return self.lidar
 
 
+@dataclass(frozen=True, eq=False)
+class Range:
+    """One distance, to the nearest thing in the cone of a sonar, a radar, or another `RangeSensor`.
+
+    A mapper turns it into a `Cloud` of rays that fill the cone, half a cell apart at its end.
+
+    Attributes:
+        distance: Metres. +inf: nothing was heard; -inf: something is nearer than `range_min`; NaN: no reading (REP
+            117).
+        T_world_sensor: (4, 4) float64, maps the sensor's frame (x along the cone, y left, z up) into the world (z up).
+        stamp_ns: As in `Frame`.
+        beam: The sensor: its cone, limits and noise.
+        name: As in `Frame`.
+        fault: As in `Frame`.
+        fault_detail: As in `Frame`.
+        sensor: As in `Frame`.
+        pose_off_ns: As in `Frame`.
+        pose_sigma: As in `Frame`.
+    """
+
+    distance: float
+    T_world_sensor: Transform
+    stamp_ns: int = 0
+    beam: RangeSensor = field(default_factory=RangeSensor)
+    name: str = ""
+    fault: str | None = None
+    fault_detail: str = ""
+    sensor: str = ""
+    pose_off_ns: int = 0
+    pose_sigma: tuple[float, float] = (0.0, 0.0)
+
+
 AnyFrame = Frame | StereoFrame | Cloud
 """What a source delivers and a mapper takes."""
 
 
-def name_of(seen: AnyFrame | Scan) -> str:
+CALLED = {Scan: "scan", Cloud: "cloud", Range: "range"}
+
+
+def name_of(seen: AnyFrame | Scan | Range) -> str:
     """Return the name of a frame or scan for messages."""
-    kind = "scan" if isinstance(seen, Scan) else "cloud" if isinstance(seen, Cloud) else "frame"
+    kind = next((word for one, word in CALLED.items() if isinstance(seen, one)), "frame")
     return seen.name or f"{kind} at {seen.stamp_ns} ns"
 
 

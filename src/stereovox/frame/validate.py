@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.rigs import StereoPair, VirtualCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import Cloud, Frame, Scan, StereoFrame, name_of
+from stereovox.frame import Cloud, Frame, Range, Scan, StereoFrame, name_of
 from stereovox.geometry import se3
 
 EXACT = 1e-14
@@ -63,11 +63,12 @@ FIELDS = {
         "origins": ARRAY_OR_NONE,
         "clear": ARRAY_OR_NONE,
     },
+    Range: {"distance": NUMBER, "beam": Field((RangeSensor,), "a RangeSensor")},
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
 }
 """The other fields of each kind; a frame's `depth` is checked by `depth.prepare`, poses by `rigid_pose`."""
-MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Cloud: ("points",), Scan: ("ranges",)}
+MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Cloud: ("points",), Scan: ("ranges",), Range: ()}
 """Fields that must not be masked arrays."""
 
 
@@ -75,7 +76,7 @@ def validate_fields(seen: Any, *kinds: type) -> None:
     """Raise FrameRefused for an object that is none of `kinds`, or that has a field of the wrong type.
 
     The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`; or the source's own
-    `fault`. kinds: out of Frame, StereoFrame, Cloud and Scan. Array elements are not checked; masked arrays are
+    `fault`. kinds: out of Frame, StereoFrame, Cloud, Range and Scan. Array elements are not checked; masked arrays are
     refused, since nothing downstream reads their mask.
     """
     for kind in kinds:

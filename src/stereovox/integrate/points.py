@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import CheckedCloud
@@ -86,7 +86,8 @@ class Points:
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0, values)
         origin = origin_block(cloud.T_world_sensor, config).astype(np.int32)
-        return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), np.empty(0, np.int16))
+        none, weak = np.empty((0, 3), np.int32), isinstance(cloud.lidar, RangeSensor)
+        return Evidence(pool.coords[: len(pool)] + origin, values, none, np.empty(0, np.int16), weak)
 
     def _laid_out(
         self, cloud: CheckedCloud, table: KernelTable

@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
@@ -21,6 +21,7 @@ from stereovox.integrate import _cells
 from stereovox.maps.cells.evidence import to_units
 from stereovox.maps.query.queries import INDEX_LIMIT
 from stereovox.maps.storage.blocks import CELLS, SIDE
+from stereovox.sensors.arc import Arc
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
 
@@ -130,10 +131,16 @@ class View(NamedTuple):
 
 
 def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCamera | Lidar) -> KernelTable:
-    """Return the kernel table of a sensor model for a camera with the configured noise, or a lidar with its own."""
+    """Return the kernel table of a sensor model for a camera with the configured noise, or a lidar with its own.
+
+    Of a cone it is that of the model `Arc`, whatever is configured; it clears nothing nearer than it measures.
+    """
+    blind = config.blind
+    if isinstance(camera, RangeSensor):
+        sensor, blind = Arc(camera.solid_angle), max(blind, camera.range_min)
     noise = RangeNoise.of(config.noise, camera)
     table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
-    return kernel_table(table, config.max_range, config.blind)
+    return kernel_table(table, config.max_range, blind)
 
 
 def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> KernelTable:

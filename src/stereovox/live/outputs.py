@@ -55,8 +55,8 @@ class Output(Protocol):
 class GridFile:
     """Keeps the 2-D map of a growing map in map_server files, rewritten in a thread of its own.
 
-    While the map is stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete. Unknown
-    cells are never free.
+    While the map is waiting, stale or lost (`Mapper.health`) the files stay as they are; at the end they are complete.
+    Unknown cells are never free.
 
     Args:
         mapper: The mapper whose map is projected.
@@ -109,12 +109,12 @@ class GridFile:
         self._worker.shutdown()
 
     def _current(self) -> bool:
-        """Return whether the map is fresh enough to be written; notify the user once if it is not."""
+        """Return whether the map is fit to be written; notify the user once if it is too old."""
         why = context_of(self._mapper).stale
-        was, self._stale = self._stale, bool(why)
-        if why and not was:
+        was, self._stale = self._stale, bool(why) and not why.startswith("waiting")  # as every run begins
+        if self._stale and not was:
             self._notify(f"{self._file}: is not updated, since the map is {why}")
-        return not self._stale
+        return not why
 
     def _write(self) -> None:
         self._new = False
@@ -200,12 +200,12 @@ class LiveSphere:
         at the last image.
 
         Raises:
-            StereovoxError: Nothing has been seen yet, or the map is stale or lost (`Mapper.health`).
+            StereovoxError: Nothing has been seen yet, or the map is waiting, stale or lost (`Mapper.health`).
         """
         if not self._last:
             raise StereovoxError("no image has been mapped yet; try again later")
         if self._mapper is not None and not self._finished and (why := context_of(self._mapper).stale):
-            raise StereovoxError(f"the distances are old, since the map is {why}; try again later")
+            raise StereovoxError(f"the distances may be wrong, since the map is {why}; try again later")
         now = None if self._poses is None or self._finished else self._poses.newest
         return together(self._last, now[:2] if now is not None and np.isfinite(now.T_world_body).all() else None)
 

@@ -10,10 +10,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
+from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage, Range
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
@@ -33,6 +33,11 @@ FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
 """Most points of a frame in doubt that a glance keeps, that are looked up in the map, and that faults are tried on."""
+CONFIRMED, CONTRADICTED = 0.85, 0.7
+"""The first frames count once another agrees with the map in this share of its points on known cells; below the second
+they are taken out, and between both if most is known: from elsewhere, good frames agree less."""
+OVERLAP, MOST = 0.25, 0.5
+"""Share of a frame's points that must be known for a judgement, and to count as most."""
 GAIN = 0.1
 """Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
@@ -91,21 +96,41 @@ class Comparison:
         self._prepared = False
 
     def check(
-        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
+        self, frame: AnyFrame | Range, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
     ) -> GateResult:
-        """Return what the gate needs to accept the frame.
+        """Return what the gate needs to accept the frame; a cone is not compared, for it yields to the map.
 
         evidence: the evidence of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
-        `Gate.check_agreement`.
+        `Gate.check_agreement`; not while the map is provisional, for either may be wrong: it then begins anew.
         """
-        if not self._compares:
+        if not self._compares or isinstance(image.camera, RangeSensor):
             return passed
         self._prepare(voxel_map, image)
+        if voxel_map.history.is_provisional:
+            passed = self._confirmed(image, passed, voxel_map)
+            if passed.takes_out:
+                return passed
         against = voxel_map.storage.agreement(evidence, self._firm[image.camera]).against
         with voxel_map.lock:
             doubted = self._gate.in_doubt(passed, against)
             sight = self._sight(image, self._gate.doubt(passed), voxel_map) if doubted else None
             return self._gate.check_agreement(frame, passed, against, sight)
+
+    def _confirmed(self, image: AnyImage, passed: GateResult, voxel_map: VoxelMap) -> GateResult:
+        """Return the result for a frame whose map is of frames that none has confirmed.
+
+        Its points are looked up in any cell, since no cell is certain yet.
+        """
+        points = thinned(_sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), POINTS)
+        tolerance = _tolerance(voxel_map, points, self._noise[image.camera].sigma)
+        with voxel_map.lock:
+            placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance), voxel_map.history.frames
+        agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
+        if known < max(FEW, OVERLAP * len(points)):
+            return passed
+        if agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
+            return passed._replace(takes_out=frames, glances=())
+        return passed._replace(confirms=agree >= CONFIRMED * known)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Inspect the first image, so that kernels compile now and not when a frame is in doubt."""
@@ -152,7 +177,7 @@ def sight(
     search for another pose.
     """
     points = thinned(seen, POINTS)
-    tolerance = np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
+    tolerance = _tolerance(surfaces, points, sigma)
     placed = _placed(surfaces, T, points, tolerance)
     against = placed.against
     known = int((placed.agrees | against).sum())
@@ -162,6 +187,12 @@ def sight(
         votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
     wrong = fault(points, tolerance, placed, frames % EVERY == 0)
     return Sight(anchored, wrong, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
+
+
+def _tolerance(
+    surfaces: Surfaces, points: NDArray[np.float64], sigma: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    return np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
 
 
 class Placed(NamedTuple):

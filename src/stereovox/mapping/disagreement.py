@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, Scan, name_of
+from stereovox.frame import AnyFrame, Range, Scan, name_of
 from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, DisagreementSpell, History, RunningMean
 
@@ -149,7 +149,7 @@ class DisagreementMonitor:
         return not self._agrees(doubt, sensor, stamp_ns, against)
 
     def check(
-        self, frame: AnyFrame | Scan, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan | Range, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
     ) -> Agreement:
         """Return what `accept` needs once the map has changed.
 
@@ -217,7 +217,12 @@ class DisagreementMonitor:
         return CONTRADICTS if self._lasted(doubt, self._changed_ns) else DISAGREES
 
     def _refusal(
-        self, frame: AnyFrame | Scan, against: float | None, limit: float, doubt: DisagreementSpell, sight: Sight
+        self,
+        frame: AnyFrame | Scan | Range,
+        against: float | None,
+        limit: float,
+        doubt: DisagreementSpell,
+        sight: Sight,
     ) -> FrameRefused:
         detail = f"it disagrees with the map in {against or 0:.0%} of its evidence (limit {limit:.0%})"
         if against is None:

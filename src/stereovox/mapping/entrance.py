@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from stereovox.depth import DepthPipeline, cloud, quality, scan
+from stereovox.depth import DepthPipeline, cloud, quality, ranges, scan
 from stereovox.depth.prepare import _check_image, prepare
 from stereovox.depth.stereo import pipeline as stereo
 from stereovox.frame import validate
@@ -25,8 +25,9 @@ from stereovox.maps.grid_map import GridStorage
 
 IMAGE, PAIR, CLOUD = "depth image", "stereo pair", "cloud"
 SCAN, IMAGE_SCAN, PAIR_SCAN = "2-D scan", "depth image to scan", "stereo pair to scan"
-KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN
-"""Kinds of input: the first three enter a `Mapper`, the others a `GridMapper`."""
+RANGE = "range"
+KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN, RANGE
+"""Kinds of input: the first three and ranges enter a `Mapper`, the others a `GridMapper`."""
 Refuses = Callable[..., Any]
 Cell = Refuses | tuple[Refuses, ...] | str
 """The function that refuses a bad input, or several (the later ones back up the first); or why nothing is checked."""
@@ -48,13 +49,15 @@ class Check(NamedTuple):
     setting: str = ""
 
 
-def _cells(one: Cell, *others: Cell) -> dict[str, Cell]:
-    """Return the cells of all kinds: one for all, three (images and pairs, clouds, scans), or six."""
-    if not others:
-        return dict.fromkeys(KINDS, one)
+def _cells(one: Cell, *others: Cell, ranged: Cell | None = None) -> dict[str, Cell]:
+    """Return the cells of all kinds: one for all, three (images and pairs, clouds, scans), or six.
+
+    ranged: that of ranges; None: that of the clouds which they become.
+    """
     if len(others) == 2:
-        return dict(zip(KINDS, (one, one, *others, one, one), strict=True))
-    return dict(zip(KINDS, (one, *others), strict=True))
+        others = (one, *others, one, one)
+    cells = dict(zip(KINDS, (one, *others) if others else [one] * 6, strict=False))
+    return {**cells, RANGE: cells[CLOUD] if ranged is None else ranged}
 
 
 METRES = "its numbers are metres by definition; see `bad_units`"
@@ -65,6 +68,8 @@ LIT = "it is no picture: bad light leaves values missing"
 BOUNDED = "the grid's work is bounded by `max_range`, which may span 4096 cells"
 NO_PIXELS = "it has no pixels"
 BY_CAMERA = "the camera bounds its size"
+ONE_NUMBER = "it is one number; see `no_valid_range`"
+YIELDS = "it yields to the map: what is surely occupied stays, and an arc confirms no occupied cell"
 ANY_MAPPER = "both mappers accept it"
 FAULT_OF_PAIR = validate.validate_fields, stereo.grey_rectified
 
@@ -75,7 +80,7 @@ CHECKS = (
     Check("bad_form", "the mapper does not accept this kind",
           _cells(ANY_MAPPER, ANY_MAPPER, 
                  (DepthPipeline.matched, validate.validate_fields, validate._check_fields), validate.validate_fields,
-                 ANY_MAPPER, ANY_MAPPER)),
+                 ANY_MAPPER, ANY_MAPPER, ranged=validate.validate_fields)),
     Check("bad_stamp", "a stamp is no int64", _cells(validate._check_fields)),
     Check("bad_sensor", "the sensor's name is not text", _cells(validate._check_fields)),
     Check("bad_sensor", "the sensor's name is not printable, or longer than 256 characters",
@@ -85,10 +90,10 @@ CHECKS = (
           _cells(validate.validate_fields, FAULT_OF_PAIR, *[validate.validate_fields] * 3, FAULT_OF_PAIR)),
     Check("bad_dtype", "values have the wrong type",
           _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
-                 stereo.grey)),
+                 stereo.grey, ranged="it is one number; see `bad_form`")),
     Check("bad_shape", "the shape of an array does not match its camera, or its points",
           _cells(_check_image, stereo.grey, cloud._points, validate.validate_scan, _check_image,
-                 stereo.grey)),
+                 stereo.grey, ranged="it is one number; see `bad_form`")),
     Check("bad_scale", "integer depths have no positive `depth_scale`: 1500 may be 1.5 m or 1.5 km",
           _cells(_check_image, FROM_PAIR, METRES, METRES, _check_image, FROM_PAIR)),
     Check("bad_reason", "reasons of pixels are invalid",
@@ -98,12 +103,13 @@ CHECKS = (
     Check("view_too_large", "there is evidence on more cells than can be kept or fit the image",
           _cells(views.check_blocks, views.check_blocks, Points._is_wide, BOUNDED, BOUNDED, BOUNDED)),
     Check("too_many_points", "a cloud has over 8,388,608 points", 
-          _cells(BY_CAMERA, cloud._points, "see `too_many_beams`")),
+          _cells(BY_CAMERA, cloud._points, "see `too_many_beams`",
+                 ranged="as many rays as its cone needs are made here")),
     Check("too_many_beams", "a scan has over 65,536 beams",
           _cells(BY_CAMERA, "see `too_many_points`", beams._beams_of)),
     Check("bad_scan", "angles or limits are invalid", _cells(BY_CAMERA, NO_PIXELS, validate.validate_scan)),
     Check("bad_clear", "`clear` or `clear_from` has the wrong length",
-          _cells("it has none", "see `bad_shape`", beams._beams_of)),
+          _cells("it has none", "see `bad_shape`", beams._beams_of, ranged="it has none")),
     Check("no_pose", "there is no pose", _cells(validate.rigid_pose)),
     Check("pose_not_finite", "the pose holds NaN or infinity", _cells(validate._check_place)),
     Check("pose_too_far", "the position is 1000 km or more from the origin", _cells(validate._check_place)),
@@ -124,21 +130,24 @@ CHECKS = (
     Check("pose_jump", "it would have moved at more than 40 m/s or 1500 degrees/s", _cells(Gate._settled),
           "trust.max_speed_mps, trust.max_turn_dps"),
     Check("frozen_image", "it is identical to the previous one, but the sensor has moved by over 1 cm or 0.5 degrees",
-          _cells(Gate._look), "trust.frozen"),
+          _cells(Gate._look, ranged="one number may well be the one before"), "trust.frozen"),
     Check("frozen_image", "it repeats what the sensor saw from elsewhere, with new noise",
-          _cells(*[Gate._glances] * 3, *["a scan may look the same from many places"] * 3), "trust.frozen"),
+          _cells(*[Gate._glances] * 3, *["a scan may look the same from many places"] * 3,
+                 ranged="one number may well be the one before"), "trust.frozen"),
     Check("bad_units", "half of its depths or ranges are far above or far below the map's limits",
-          _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays)),
+          _cells(quality.check_unit, quality.check_unit_of_rays, quality.check_unit_of_rays, ranged=ONE_NUMBER)),
     Check("no_valid_depth", "not one pixel has a value, and none is too far",
           _cells(prepare, "see `no_valid_point`", "see `no_valid_range`")),
-    Check("no_valid_point", "not one ray can be used", _cells("see `no_valid_depth`", cloud.checked_cloud,
-                                                             "see `no_valid_range`")),
-    Check("no_valid_range", "not one beam has a range",
-          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan)),
+    Check("no_valid_point", "not one ray can be used",
+          _cells("see `no_valid_depth`", cloud.checked_cloud, "see `no_valid_range`", ranged=ONE_NUMBER)),
+    Check("no_valid_range", "not one beam has a range, or nothing was heard, which clears nothing (`silence_clears`)",
+          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan, ranged=ranges.cloud_of)),
     Check("too_few_values", "less than 0.5 % of the pixels, points or beams have a value or are too far",
-          _cells(quality._check_share, quality._check_number, quality._check_number), "trust.min_valid_share"),
+          _cells(quality._check_share, quality._check_number, quality._check_number,
+                 ranged=ONE_NUMBER), "trust.min_valid_share"),
     Check("no_surfaces", "less than half of the values resemble their neighbours, as values on surfaces do",
-          _cells(quality.check_depth, quality._check_alike, quality._check_alike), "trust.min_surface_share"),
+          _cells(quality.check_depth, quality._check_alike, quality._check_alike,
+                 ranged=ONE_NUMBER), "trust.min_surface_share"),
     Check("too_dark", "90 % of an image is black",
           _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
     Check("overexposed", "90 % of an image is saturated",
@@ -157,11 +166,11 @@ CHECKS = (
           _cells(SPACE, SPACE, SPACE, "a lidar measures at one height", scan.check_heights, scan.check_heights),
           "scan.heights"),
     Check("disagrees_with_map", "more of it contradicts the map than is usual for its sensor",
-          _cells(DisagreementMonitor.check), "trust.max_disagreement, trust.pose_error_m"),
+          _cells(DisagreementMonitor.check, ranged=YIELDS), "trust.max_disagreement, trust.pose_error_m"),
     Check("contradicts_map", "frames have disagreed for `trust.changed_s`, and do not show a changed world",
-          _cells(DisagreementMonitor.check), "trust.changed_s"),
+          _cells(DisagreementMonitor.check, ranged=YIELDS), "trust.changed_s"),
     Check("camera_moved", "frames have disagreed for `trust.changed_s`, and would agree from another pose",
-          _cells(DisagreementMonitor.check), "trust.moved_s"),
+          _cells(DisagreementMonitor.check, ranged=YIELDS), "trust.moved_s"),
     Check("memory_full", "its cells do not fit into `max_memory`",
           _cells(CappedStorage.check_room, CappedStorage.check_room, CappedStorage.check_room, GridStorage.check_room,
                  GridStorage.check_room, GridStorage.check_room), "max_memory, when_full"),
@@ -183,6 +192,7 @@ ELSEWHERE = {
     "no_camera": "ROS 2: no camera info was received",
     "tracking_lost": "tracking: the camera's pose is unknown",
     "no_photo": "tracking: a depth image has no color image taken with it",
+    "unconfirmed": "first frames of a map that the next one contradicts; they are taken out again",
     "not_in_order": "SLAM and localisation: not later than the previous scan",
 }
 """Reasons that sources, trackers and localisation give as the `fault` of a frame, which is then refused."""

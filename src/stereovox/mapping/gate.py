@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Scan, StereoFrame, name_of
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
 from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, moved_on, with_glance
@@ -38,6 +38,8 @@ DIGEST_ROWS = 16
 """Rows of an image that its checksum covers."""
 DIGEST_POINTS = 1024
 """Points of a cloud that its checksum covers; many may have no value."""
+RESOLUTION_M, SILENCE, SPREAD = 1e-4, 1 << 40, 3.0
+"""Distances of cones are remembered in these steps; that of silence; and how many sigma the same echo may differ."""
 ROUGH, ROUGH_SHARE = 1e-3, 0.2
 """Measured inverse depth bends by more than this share of itself, at more than this share of the pixels; walls without
 noise do not, and look the same from many places."""
@@ -48,6 +50,9 @@ class GateResult(NamedTuple):
 
     after: the reason of the refusals that it ends, mostly "". look: checksum of its image, None if `trust.frozen` is
     off. agreement: how it agrees with the map, None if they were not compared. glances: those to keep for its sensor.
+    confirms: whether it is the first to agree with the map. takes_out: number of frames before it, none of which has
+    been confirmed, and which it contradicts: the map begins anew with it. is_cone: whether it is a `Range`. repeats:
+    whether it adds nothing to what its sensor has heard from the same place.
     """
 
     sensor: str
@@ -56,10 +61,16 @@ class GateResult(NamedTuple):
     look: ImageFingerprint | None = None
     agreement: Agreement | None = None
     glances: tuple[Glance, ...] = ()
+    confirms: bool = False
+    takes_out: int = 0
+    is_cone: bool = False
+    repeats: bool = False
 
     @property
     def note(self) -> str:
         """Line for the report, "" if there is nothing to report."""
+        if self.takes_out:
+            return "the map begins anew: the frames before contradict this one, and none had been confirmed"
         return f"frames of '{self.sensor}' are accepted again after {self.after}" if self.after else ""
 
 
@@ -75,14 +86,14 @@ class Gate:
     def __init__(self, config: Config, history: History):
         trust = config.trust
         self._history, self._trust, self._monitor = history, trust, DisagreementMonitor(config, history)
-        self._views = FrozenViews(config)
+        self._views, self._cell = FrozenViews(config), config.voxel_size
         self._turn = radians(trust.max_turn_dps)
         off, reset, ahead, settle = trust.max_pose_off_s, trust.clock_reset_s, trust.max_gap_s, trust.settle_s
         self._off_ns, self._reset_ns, self._ahead_ns, self._settle_ns = (
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan) -> GateResult:
+    def check(self, frame: AnyFrame | Scan | Range, image: AnyImage | Scan) -> GateResult:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -92,7 +103,10 @@ class Gate:
         sensor, stamp_ns = self._identify(frame)
         numbers = image.T_world_sensor.ravel().tolist()
         now = StampedPose(stamp_ns, tuple(numbers[:12]))
-        passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
+        passed = self._fitting(frame, sensor, now)
+        if isinstance(frame, Range):
+            return self._heard(frame, passed)
+        passed = passed._replace(look=self._look(frame, sensor, now))
         if passed.after:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
             self._history.glances.pop(sensor, None)
@@ -114,7 +128,7 @@ class Gate:
         return any(abs(one.pose[11] - height) > metres for name, one in trusted.items() if name != passed.sensor)
 
     def check_agreement(
-        self, frame: AnyFrame | Scan, passed: GateResult, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan | Range, passed: GateResult, against: float | None, sight: Sight | None
     ) -> GateResult:
         """Return what `accept` needs for a frame that was compared with the map.
 
@@ -133,10 +147,13 @@ class Gate:
             self._history.glances[passed.sensor] = passed.glances
         if passed.agreement is not None:
             self._monitor.accept(passed.sensor, passed.agreement)
+        self._history.cones += passed.is_cone
+        if passed.confirms:
+            self._history.unconfirmed = 0
         if passed.after:
             self._history.settled[passed.after] += 1
 
-    def _identify(self, frame: AnyFrame | Scan) -> tuple[str, int]:
+    def _identify(self, frame: AnyFrame | Scan | Range) -> tuple[str, int]:
         """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses far off in time."""
         off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
@@ -147,6 +164,7 @@ class Gate:
             detail = f"the sensor has no printable name of at most {MAX_NAME_LENGTH} characters; rename it"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
         usual = "scan" if isinstance(frame, Scan) else "lidar" if isinstance(frame, Cloud) else "camera"
+        usual = "range" if isinstance(frame, Range) else usual
         return frame.sensor or usual, int(frame.stamp_ns)
 
     def _look(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> ImageFingerprint | None:
@@ -162,6 +180,21 @@ class Gate:
             detail = f"the {what} repeats the last one, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}; restart the {cure}")
         return before
+
+    def _heard(self, seen: Range, passed: GateResult) -> GateResult:
+        """Return the result for a cone: does it repeat what its sensor heard from there before?
+
+        Echoes from one place are no independent evidence: however many there are, they come from one thing.
+        """
+        metres = float(seen.distance)
+        look = ImageFingerprint(SILENCE if metres == inf else round(metres / RESOLUTION_M), passed.seen.pose)
+        before = self._history.looks.get(passed.sensor)
+        if before is not None:
+            shift, turn = apart(before.pose, look.pose)
+            same = abs(before.digest - look.digest) * RESOLUTION_M <= SPREAD * seen.beam.sigma
+            if same and shift < self._cell and turn < seen.beam.beam / 4:
+                return passed._replace(look=before, is_cone=True, repeats=True)
+        return passed._replace(look=look, is_cone=True)
 
     def _glances(self, frame: AnyFrame | Scan, passed: GateResult, image: AnyImage) -> tuple[Glance, ...]:
         """Return the glances to keep. Raises FrameRefused for a frame that repeats a view from elsewhere."""
@@ -180,7 +213,7 @@ class Gate:
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}")
         return with_glance(glances, passed.seen, ranges)
 
-    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
+    def _fitting(self, frame: AnyFrame | Scan | Range, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one or is accepted again; refuse any other."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
@@ -208,7 +241,7 @@ class Gate:
 
     def _settled(
         self,
-        frame: AnyFrame | Scan,
+        frame: AnyFrame | Scan | Range,
         passed: GateResult,
         trusted: StampedPose,
         found: tuple[str, float],

@@ -9,7 +9,7 @@ from types import TracebackType
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Scan, UpdateReport
+from stereovox.frame import AnyFrame, AnyImage, Range, Scan, UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.wall_clock import epoch_ns
 from stereovox.kernels.threads import MapLock
@@ -40,7 +40,7 @@ class Intake:
         self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
         self._map, self._adding = target, MapLock()
 
-    def offer(self, frame: AnyFrame | Scan) -> PendingFrame:
+    def offer(self, frame: AnyFrame | Scan | Range) -> PendingFrame:
         """Return a frame that arrives now; use it in a `with` block around the integration.
 
         Raises:
@@ -49,6 +49,11 @@ class Intake:
         arrived_ns = self.monitor.now()
         self._map.lock.refuse_holder()
         return PendingFrame(self, frame, arrived_ns)
+
+    @property
+    def is_provisional(self) -> bool:
+        """Whether no two frames of the map have agreed yet."""
+        return self._map.history.is_provisional
 
     def closed(self) -> AbstractContextManager[object]:
         """Return a context that lets no frame in while it is entered."""
@@ -69,7 +74,8 @@ class Aged:
         Returns:
             State, age and recent refusals of the map.
         """
-        return self._intake.monitor.health(now_ns)
+        intake = self._intake
+        return intake.monitor.health(now_ns, intake.is_provisional)
 
     @property
     def stamp_clock(self) -> StampsBy:
@@ -117,7 +123,7 @@ class PendingFrame:
     __slots__ = ("_arrived_ns", "_frame", "_intake", "report")
     report: UpdateReport
 
-    def __init__(self, intake: Intake, frame: AnyFrame | Scan, arrived_ns: int):
+    def __init__(self, intake: Intake, frame: AnyFrame | Scan | Range, arrived_ns: int):
         self._intake, self._frame, self._arrived_ns = intake, frame, arrived_ns
 
     def __enter__(self) -> PendingFrame:

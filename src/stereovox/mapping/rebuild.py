@@ -124,6 +124,23 @@ def correct(
         raise
 
 
+def begin_anew(storage: Storage, tiles: Path | None) -> None:
+    """Empty a map, and its history, whose frames none has confirmed; the lock must be held. tiles: as above."""
+    changed = storage.coords_in_memory.copy()
+    storage.replace_contents(make_map(_without_frames(storage.config), None, _other_than(tiles, storage)).storage)
+    storage.history.begin_anew()
+    if storage.kept is not None:
+        storage.kept.clear()
+    _notify(storage, changed)
+
+
+def _notify(storage: Storage, changed: NDArray[np.int32]) -> None:
+    """Notify the listeners that blocks at (n, 3) were replaced."""
+    blocks, zeros = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
+    for listener in storage.listeners:
+        listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, zeros))
+
+
 def need_frames(kept: KeptFrames | None, where: str) -> KeptFrames:
     """Return the kept frames of a map. Raises StereovoxError if there are none; `where`: names the map."""
     if kept is None or not len(kept):
@@ -242,9 +259,7 @@ class Rebuild:
         correct_history(history, before, after)
         if self._moved:
             history.recording = as_corrected(history.recording)
-        blocks, zeros = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
-        for listener in self._storage.listeners:
-            listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, zeros))
+        _notify(self._storage, changed)
         all_frames = self._kept.are_all(self._storage.history.frames)
         return CorrectionReport(len(self._moved), 0, self._mapped, len(changed), all_frames)
 
@@ -317,8 +332,9 @@ class Rebuild:
             return evidence
         mixed, free = (_is_in(self._dirty, coords) for coords in (evidence.coords, evidence.uniform))
         return Evidence(
-            evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free]
-        )
+            evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free],
+            evidence.weak,
+        )  # fmt: skip
 
     def _check_room(self, evidence: Evidence) -> None:
         try:

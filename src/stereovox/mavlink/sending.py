@@ -39,11 +39,11 @@ class ObstacleSender:
     frame. Unknown space ends free space, as `SectorRules.unknown` sets.
 
 
-    Nothing is sent before the first frame, nor once any camera's newest frame is older than `max_age_s` or the newest
-    pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot reports its sensor as
-    failed. Ages count from the event, by its stamp (`Mapper.stamp_clock`, which becomes "live" unless set), and at
-    least from its arrival. After a jump of the body's pose nothing is sent until a frame from there is in the map.
-
+    Nothing is sent before a second frame has agreed with the first, nor once any camera's newest frame is older than
+    `max_age_s` or the newest pose is older than 0.6 of that: PX4 does not move without data for 0.5 s, and ArduPilot
+    reports its sensor as failed. Ages count from the event, by its stamp (`Mapper.stamp_clock`, which becomes "live"
+    unless set), and at least from its arrival. After a jump of the body's pose nothing is sent until a frame from there
+    is in the map.
 
     `time_usec` and `time_boot_ms` are the time of the oldest of the cameras' newest frames, by this machine's clock,
     which the autopilot may request (TIMESYNC). A map whose layers are not level is refused: nothing is sent.
@@ -187,8 +187,8 @@ class ObstacleSender:
     def _send(self) -> str:
         """Send the current distances; return why not, or "" if sent."""
         health, newest = self._mapper.health(), self._body.newest
-        if newest is None or not health.ages_s:
-            return ""  # nothing has arrived yet: not worth a report
+        if newest is None or health.state == "waiting":
+            return ""  # too little has arrived yet: not worth a report
         ages_s = {sensor: age_s + self._waited_s.get(sensor, 0.0) for sensor, age_s in health.ages_s.items()}
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1])
         if age_s > self._max_age_s:

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stereovox.config import Config
-from stereovox.maps.record.health import STALE, Health
+from stereovox.maps.record.health import UNFIT, Health
 from stereovox.products.floor.floor_axes import up_of
 from stereovox.products.floor.floor_heights import FloorHeights
 
@@ -55,8 +55,8 @@ class MapContext:
 
     @property
     def stale(self) -> str:
-        """Why the map is too old to act on; "" if it is not, or is no live map."""
-        return self.health.text if self.health is not None and self.health.state in STALE else ""
+        """Why the map is too old to act on, or waiting for frames; "" if it is not, or is no live map."""
+        return self.health.text if self.health is not None and self.health.state in UNFIT else ""
 
 
 def context_of(mapper: HasMap, world: str = "map") -> MapContext:
@@ -103,7 +103,7 @@ ALL_CELLS = "carries along: unknown cells stay unknown"
 SOLID = "carries along: only what is surely occupied; what is missing says nothing"
 LEVEL = "refuses: a map whose layers are not level"
 FLOOR_2D = "carries along: heights are measured as `projection.project` documents"
-SILENT = "refuses: silent while the map is stale or lost"
+SILENT = "refuses: silent while the map is waiting, stale or lost"
 EVENT = "carries along: the stamp of the newest frame"
 OLD = "refuses: silent once what was seen is too old, by its stamp"
 SOLIDS = Leaves(WORLD, SPACE, NO_FLOOR, OFFLINE, JUDGED, SOLID)

@@ -127,8 +127,11 @@ class Obstacles:
             publisher.publish(points_message(lifted, stamp_ns, world))
 
     def _stale(self) -> str:
-        """Return a line about a sensor whose newest trusted frame is too old; "" for none."""
-        ages_s, most_s = self._mapping.health().ages_s, self._mapping.config.trust.stale_s
+        """Return a line about a sensor whose newest trusted frame is too old, or unconfirmed; "" for none."""
+        health, most_s = self._mapping.health(), self._mapping.config.trust.stale_s
+        if health.state == "waiting":
+            return health.text
+        ages_s = health.ages_s
         sensor, age_s = max(ages_s.items(), key=lambda item: item[1], default=("", 0.0))
         stale = age_s > most_s
         return f"the last trusted frame of {sensor} is {age_s:.2f} s old (trust.stale_s {most_s:g})" if stale else ""

@@ -17,7 +17,7 @@ from stereovox.errors import StereovoxError
 from stereovox.formats.octomap import binary_tree, full_tree
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.maps.record.health import STALE, Health
+from stereovox.maps.record.health import STALE, UNFIT, Health
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.ros.library import optional_message
 from stereovox.ros.mapping import Mapping
@@ -120,7 +120,7 @@ def _format_value(value: object) -> str:
 
 
 class Outputs:
-    """Publishes a map that frames have changed, unless it is stale or lost; also after a correction, and at the end.
+    """Publishes a map that frames have changed unless its health forbids it, also after a correction, and at the end.
 
     Each message has the stamp of the map's newest frame; diagnostics always give its age.
 
@@ -194,7 +194,7 @@ class Outputs:
         if health.state in STALE:
             text = f"the map is not published, since it is {health.text}"
             self._node.get_logger().error(text, throttle_duration_sec=10.0)
-        return health.state not in STALE
+        return health.state not in UNFIT
 
     def _publish_map(self, now: float) -> None:
         self._new_map = self._corrected = False

@@ -53,7 +53,7 @@ class Stereo:
 
     def hit(self, z_measured: Array, sigma: Array, voxel_size: float) -> Array:
         """Return the probability of the cell that holds the measured point, at even prior odds; at least p_least."""
-        p = self.p_right * _stays(np.asarray(sigma) / voxel_size)
+        p = self.p_right * stays(np.asarray(sigma) / voxel_size)
         evidence = self.trust * (np.log(p / (1 - p)) - np.log(self.prior / (1 - self.prior)))
         return np.maximum(1 / (1 + np.exp(-evidence)), self.p_least)
 
@@ -63,7 +63,7 @@ class Stereo:
         return 1 / (1 + (hit / (1 - hit)) ** self.passes)
 
 
-def _stays(ratio: Array) -> Array:
+def stays(ratio: Array) -> Array:
     """Return the probability that noise of `ratio` cells leaves a point in its cell, averaged over the cell.
 
     The mean of Phi((1 - x) / r) - Phi(-x / r) over x from 0 to 1.

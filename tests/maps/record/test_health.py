@@ -31,7 +31,9 @@ class Clock:
 
 def mapper_and_clock(**settings):
     clock = Clock()
-    return sv.Mapper(voxel_size=0.25, max_range=3.0, clock=clock, **settings), clock
+    mapper = sv.Mapper(voxel_size=0.25, max_range=3.0, clock=clock, **settings)
+    mapper.map.history.unconfirmed = 0  # these are about time; see test_first_frame
+    return mapper, clock
 
 
 def frame(**changes):

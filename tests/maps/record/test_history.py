@@ -110,6 +110,7 @@ LIES = {
     "loops without those that were refused": lambda s: s["loops"].pop("refused"),
     "more loops than lines": lambda s: s["loops"]["closed"].update(number=2),
     "a loop with half a place": lambda s: s["loops"]["closed"].update(ends="AAAA"),
+    "half a try": lambda s: s["history"].update(unconfirmed=0.5),
     "no beginning": lambda s: s["history"]["waiting"]["left"].pop("since_ns"),
 }
 

@@ -58,12 +58,16 @@ class Evidence:
     coords: (n, 3) int32 block coordinates; values: (n, 512) int16, zero if the frame says nothing.
     uniform: (m, 3) int32 wholly free blocks; uniform_values: (m,) int16, negative, the evidence for every cell of each
         block.
+    weak: whether it yields to the map: what is surely occupied is not cleared by it, and no occupied cell confirmed.
+    again: whether it repeats what was added before: it then only takes free cells back, until they are not free.
     """
 
     coords: NDArray[np.int32]
     values: NDArray[np.int16]
     uniform: NDArray[np.int32]
     uniform_values: NDArray[np.int16]
+    weak: bool = False
+    again: bool = False
 
     def __post_init__(self) -> None:
         if np.ndim(self.uniform_values) == 0:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.cameras.lidar import Lidar
+from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
@@ -34,7 +34,13 @@ IN_A_PACK = 64
 """Frames in a file."""
 MAX_INDEX = 1 << 29
 """Most bytes of an index; a frame takes less than a kilobyte."""
-CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera, "lidar": Lidar}
+CAMERAS = {
+    "pinhole": PinholeCamera,
+    "spherical": SphericalCamera,
+    "cylindrical": CylindricalCamera,
+    "range_sensor": RangeSensor,
+    "lidar": Lidar,
+}
 QUALITIES = (FULL, "near", "coarse")
 MAX_NAME = 4096
 """Most letters of a frame's name."""

@@ -18,7 +18,9 @@ FULL = "full"
 """Name of the quality level that omits nothing."""
 State = Literal["waiting", "current", "degraded", "stale", "lost"]
 STALE: tuple[State, ...] = ("stale", "lost")
-"""States in which a map is too old to act on: outputs of a growing map fall silent."""
+"""States in which a map is too old to act on."""
+UNFIT: tuple[State, ...] = ("waiting", *STALE)
+"""States in which outputs of a growing map are silent."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,14 @@ class Health:
     """How current a map is.
 
     Attributes:
-        state: `waiting`: no trusted frame yet. `current`. `degraded`: recent frames were refused or used at reduced
-            quality, or one of several sensors is silent. `stale`, `lost`: the last trusted frame is older than
-            `trust.stale_s`, `trust.lost_s`; also stale while frames of any sensor arrive that late.
+        state: `waiting`: no trusted frame yet, or no second one that agrees with the first. `current`. `degraded`:
+            recent frames were refused or used at reduced quality, or one of several sensors is silent. `stale`,
+            `lost`: the last trusted frame is older than `trust.stale_s`, `trust.lost_s`; also stale while frames of any
+            sensor arrive that late.
         age_s: Seconds since the last trusted frame was taken, by its stamp (`Mapper.stamp_clock`), and at least since
-            it arrived; None while waiting.
+            it arrived; None before the first.
         ages_s: The same for each sensor.
-        stamp_ns: Time of the last trusted frame by its own clock, in nanoseconds; None while waiting.
+        stamp_ns: Time of the last trusted frame by its own clock, in nanoseconds; None before the first.
         frames: Frames offered within the last `trust.lost_s` seconds.
         refused: How many of these were refused, by reason.
         reduced: How many of these were used at reduced quality, by quality level.
@@ -117,8 +120,8 @@ class HealthMonitor:
         """Record a frame that was refused."""
         self._recent.append((arrived_ns, str(reason), FULL))
 
-    def health(self, now_ns: int | None = None) -> Health:
-        """Return the health at `now_ns` by the clock; None: now."""
+    def health(self, now_ns: int | None = None, provisional: bool = False) -> Health:
+        """Return the health at `now_ns` by the clock; None: now. provisional: no two frames have agreed yet."""
         now, taken = self.now(now_ns), self._taken.copy()  # another thread may add
         ages = {sensor: self._age_ns(one, now) for sensor, one in taken.items()}
         late = {sensor: ns for sensor, one in taken.items() if (ns := self._late_ns(one, now)) > self._stale_ns}
@@ -128,6 +131,8 @@ class HealthMonitor:
         age = min(ages.values(), default=None)
         silent = {sensor: ns for sensor, ns in ages.items() if ns > self._stale_ns}
         state = self._state(age, bool(late), bool(refused or reduced or silent))
+        if provisional and state not in STALE:
+            state = "waiting"
         text = _text(state, age, len(recent), refused, reduced, silent, late)
         seconds = {sensor: ns / 1e9 for sensor, ns in ages.items()}
         return Health(
@@ -168,6 +173,8 @@ def _text(
             listed += f", {others} x other" if others else ""
             parts.append(f"{counts.total()} of {frames} frames {word} ({listed})")
     parts += [f"frames of '{sensor}' arrive {ns / 1e9:.2f} s late" for sensor, ns in list(late.items())[:3]]
+    if state == "waiting" and age_ns is not None:
+        parts.append("no frame has confirmed the first one yet")
     if state == "degraded":
         parts += [f"sensor '{sensor}' silent for {ns / 1e9:.2f} s" for sensor, ns in list(silent.items())[:3]]
     return f"{state}: {'; '.join(parts)}"

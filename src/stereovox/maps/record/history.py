@@ -23,6 +23,8 @@ MAX_SENSORS = 64
 MAX_REASONS = 256
 """Most reasons by which refusals are counted; further ones count as OTHERS."""
 OTHERS = "others"
+UNCONFIRMED, TRIES = "unconfirmed", 10
+"""Reason under which first frames count that were taken out again, and how often a map may begin anew."""
 MAX_NAME_LENGTH = 256
 MAX_NOTES = 16
 """Most notes about an imported file."""
@@ -130,6 +132,8 @@ class History:
         loops: The loops that were closed; None if nobody searched for loops, or poses were corrected otherwise since.
         recordings: Number of recordings that were merged by their given poses; 1 without a merge, or if `join` made
             one path of them, which it can if they were recorded one after the other.
+        unconfirmed: How often the map may still begin anew with a frame that contradicts it; 0 once two frames agreed.
+        cones: How many of the frames are distances of sonars and the like, which are not compared.
     """
 
     frames: int = 0
@@ -148,6 +152,8 @@ class History:
     imported: Imported | None = None
     loops: LoopLines | None = None
     recordings: int = 1
+    unconfirmed: int = 0
+    cones: int = 0
 
     def made_of(self) -> str:
         """Return lines for people: the recording, or the imported file and the notes about it, or both."""
@@ -167,6 +173,19 @@ class History:
         """Count one refused frame."""
         reason = one_line(str(reason))[:MAX_NAME_LENGTH]  # as `loaded` reads it
         self.refused[reason if reason in self.refused or len(self.refused) < MAX_REASONS else OTHERS] += 1
+
+    @property
+    def is_provisional(self) -> bool:
+        """Whether it has frames that could agree, and no two of them have."""
+        return self.frames > self.cones and self.unconfirmed > 0
+
+    def begin_anew(self) -> None:
+        """Count all frames as refused, and forget their sensors."""
+        for _ in range(self.frames):
+            self.refuse(UNCONFIRMED)
+        self.frames, self.cones, self.path, self.unconfirmed = 0, 0, CameraPath(), self.unconfirmed - 1
+        for remembered in (self.quality, self.trusted, self.waiting, self.looks, self.usual, self.doubts, self.glances):
+            remembered.clear()
 
     def copied(self) -> History:
         """Return an independent copy."""
@@ -194,6 +213,8 @@ class History:
                 "usual": {name: list(usual) for name, usual in self.usual.items()},
                 "doubts": {name: _doubt_to(doubt) for name, doubt in self.doubts.items()},
                 "glances": {name: [_glance_to(one) for one in seen] for name, seen in self.glances.items()},
+                "unconfirmed": self.unconfirmed,
+                "cones": self.cones,
             },
             "camera_path": self.path.saved(),
             "loops": None if self.loops is None else self.loops.saved(),
@@ -229,6 +250,8 @@ class History:
         history.glances = {  # older maps have none
             name: _glances_from(seen) for name, seen in _sensors(entries.get("glances", {})).items()
         }
+        history.unconfirmed = _whole(entries.get("unconfirmed", 0), "history.unconfirmed")
+        history.cones = _whole(entries.get("cones", 0), "history.cones")
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, but its reasons add up to {history.refused.total()}")
         return history

@@ -272,6 +272,10 @@ class KeptFrames:
         """Replace the first frames by as many corrected ones."""
         self._put([*frames, *self._frames[len(frames) :]])
 
+    def clear(self) -> None:
+        """Drop all frames."""
+        self._put([])
+
     def _put(self, frames: list[KeptFrame]) -> None:
         self._frames, self._bytes = frames, sum(frame.packed.content.size for frame in frames)
         self._last = {frame.sensor: frame.seen for frame in frames}

@@ -220,7 +220,9 @@ class RollingStorage(Storage):
             evidence.coords, evidence.values, evidence.uniform, evidence.uniform_values,
             low, high, coords, values, uniform, uniform_values,
         )  # fmt: skip
-        return Evidence(coords[:kept], values[:kept], uniform[:whole], uniform_values[:whole])
+        return Evidence(
+            coords[:kept], values[:kept], uniform[:whole], uniform_values[:whole], evidence.weak, evidence.again
+        )
 
     def _move(self, before: Box, now: Box) -> None:
         if self._store is None:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -199,7 +200,7 @@ class Storage(Guarded):
         """Add the evidence of one frame; return the number of cells whose value changed."""
         if not (len(evidence.coords) or len(evidence.uniform)):
             return 0
-        mine = self._in_my_units(evidence)
+        mine = self._in_my_units(self._yielding(evidence) if evidence.weak else evidence)
         if self._times is not None:
             self._times.write(mine, self._now_ns)
         changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_values, self.config.threads)
@@ -324,6 +325,21 @@ class Storage(Guarded):
         cells[has_row] = stored.values[places[has_row]]
         cells[places >= len(stored.values)] = stored.lowest
         return cells
+
+    def _yielding(self, evidence: Evidence) -> Evidence:
+        """Return weak evidence without what would clear a surely occupied cell, or add to an occupied one.
+
+        Of evidence that repeats, only what is for something in a free cell.
+        """
+        stored = self.cells_of(evidence.coords).astype(np.int32)
+        if evidence.again:
+            free = (stored <= self.rules.thresholds.free_most) & (stored != self.cell_format.unknown)
+            values = np.where(free & (evidence.values > 0), evidence.values, np.int16(0))
+            some = values.any(axis=1)
+            return Evidence(evidence.coords[some], values[some], evidence.uniform[:0], evidence.uniform_values[:0])
+        occupied, sure = stored >= self.rules.thresholds.occupied_least, stored >= self.rules.sure[2]
+        against = (evidence.values > 0) & occupied | (evidence.values < 0) & sure
+        return replace(evidence, values=np.where(against, np.int16(0), evidence.values))
 
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sonar's or radar's distance as rays that fill its cone."""
+
+from __future__ import annotations
+
+from math import ceil, cos, inf, pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import Cloud, Range, name_of
+from stereovox.frame.validate import validate_fields
+from stereovox.sensors.model import REACH_SIGMA
+
+APART = 0.5
+"""Distance between neighbouring rays at their end, in cells."""
+MOST = 1 << 18
+"""Most rays of one cone: beyond, cells between them stay as they are."""
+GOLDEN = pi * (3 - sqrt(5))
+
+
+def cloud_of(seen: Range, config: Config) -> Cloud:
+    """Return the rays of a cone: to its arc at the distance, or free ones up to where nothing was heard.
+
+    Rays instead of an integrator of its own: limits, noise, cells, threads and all checks are those of clouds, whose
+    kernel already lets a cell that holds an end outweigh whatever passes it.
+
+    Raises FrameRefused as `validate_fields`, and `no_valid_range`: there is no distance within the sensor's limits,
+    or nothing was heard and that clears nothing.
+    """
+    validate_fields(seen, Range)
+    beam, distance = seen.beam, float(seen.distance)
+    silent = distance == inf
+    if silent and not beam.silence_clears:
+        raise FrameRefused("no_valid_range", f"{name_of(seen)}: nothing was heard, which clears nothing")
+    if not silent and not beam.range_min <= distance <= beam.range_max:
+        limits = f"it measures {beam.range_min:g} to {beam.range_max:g} m"
+        raise FrameRefused("no_valid_range", f"{name_of(seen)}: its distance is {distance:g}; {limits}")
+    end = max(beam.range_max - REACH_SIGMA * beam.sigma, 0.0) if silent else distance
+    apart = APART * min(config.cell) / max(min(end, config.max_range), min(config.cell))
+    rays = end * directions(beam.beam, min(ceil(beam.solid_angle / apart**2), MOST))
+    return Cloud(
+        np.empty((0, 3)) if silent else rays, seen.T_world_sensor, seen.stamp_ns, beam, clear=rays if silent else None,
+        name=seen.name, sensor=seen.sensor, pose_off_ns=seen.pose_off_ns, pose_sigma=seen.pose_sigma,
+    )  # fmt: skip
+
+
+def directions(beam: float, number: int) -> NDArray[np.float64]:
+    """Return unit vectors (N, 3) that fill a cone about x evenly, on a spiral (Vogel 1979). beam: its full width."""
+    k = np.arange(number)
+    x = 1 - (k + 0.5) / number * (1 - cos(beam / 2))
+    aside = np.sqrt(np.maximum(1 - x * x, 0))
+    return np.stack([x, aside * np.cos(GOLDEN * k), aside * np.sin(GOLDEN * k)], axis=1)

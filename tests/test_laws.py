@@ -124,7 +124,7 @@ def test_a_wall_stays_whatever_hides_it(integrator, camera, why):
 @settings(LAWS, max_examples=10)
 @given(seed=st.integers(0, 2**31), camera=st.sampled_from(sorted(CAMERAS)))
 def test_the_order_of_frames_does_not_matter_before_the_clamp(integrator, seed, camera):
-    wide = {"map.log_odds_min": -30, "map.log_odds_max": 30}
+    wide = {"map.log_odds_min": -30, "map.log_odds_max": 30, "trust.max_disagreement": 1}  # they contradict each other
     frames = [made_frame(seed + number, CAMERAS[camera], patches=False) for number in range(3)]
     maps = []
     for order in ((0, 1, 2), (2, 0, 1)):

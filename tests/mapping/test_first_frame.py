@@ -8,6 +8,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.evaluate.summary import summarise
+from stereovox.mapping import comparison
 from stereovox.maps.record.history import TRIES
 from stereovox_lab.checks.lasting import FAULTS, Bad, Walk, _always
 
@@ -115,6 +116,22 @@ def test_what_sees_nothing_known_neither_confirms_nor_contradicts(walk):
     assert [report.taken_out for report in reports] == [0, 0]
     assert (mapper.map.frames, mapper.health().state) == (2, "waiting")
     assert mapper.add(walk[0][1]).taken_out == 0
+    assert mapper.health().state == "current"
+
+
+def test_many_frames_that_do_not_contradict_each_other_count_as_well(walk, monkeypatch):
+    monkeypatch.setattr(comparison, "ENOUGH", 1)
+    far = replace(walk[1][0], stamp_ns=walk[0][0].stamp_ns + 10**8, sensor="another")
+    mapper, _ = mapped([walk[0][0], far])
+    assert mapper.health().state == "current"
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.02])
+def test_small_cells_do_not_make_noise_a_contradiction(voxel_size):
+    """A cell smaller than the noise holds no surface of the first frame if the second is off by that noise."""
+    source = sv.open_source("sim:room?image_width=160")
+    mapper, reports = mapped([source.frame(k) for k in range(2)], voxel_size=voxel_size)
+    assert [report.taken_out for report in reports] == [0, 0]
     assert mapper.health().state == "current"
 
 

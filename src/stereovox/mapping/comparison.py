@@ -38,6 +38,9 @@ CONFIRMED, CONTRADICTED = 0.85, 0.7
 they are taken out, and between both if most is known: from elsewhere, good frames agree less."""
 OVERLAP, MOST = 0.25, 0.5
 """Share of a frame's points that must be known for a judgement, and to count as most."""
+SPREAD, ENOUGH = 3, 10
+"""How many sigma two measurements of a surface may differ, and how many frames that do not contradict each other count
+although none confirms another."""
 GAIN = 0.1
 """Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
@@ -119,18 +122,22 @@ class Comparison:
     def _confirmed(self, image: AnyImage, passed: GateResult, voxel_map: VoxelMap) -> GateResult:
         """Return the result for a frame whose map is of frames that none has confirmed.
 
-        Its points are looked up in any cell, since no cell is certain yet.
+        Its points are looked up in any cell, since no cell is certain yet. Those whose noise is wider than a cell prove
+        nothing: neither of two such measurements of a surface need be where the other is.
         """
-        points = thinned(_sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), POINTS)
-        tolerance = _tolerance(voxel_map, points, self._noise[image.camera].sigma)
+        points, history = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), voxel_map.history
+        sigma = self._noise[image.camera].sigma(np.linalg.norm(points, axis=1))
+        points, sigma = (thinned(values[sigma <= voxel_map.voxel_size], POINTS) for values in (points, sigma))
+        tolerance, tries = np.maximum(voxel_map.voxel_size, SPREAD * sigma), 1 + 2 * SPREAD
         with voxel_map.lock:
-            placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance), voxel_map.history.frames
+            placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance, tries), history.frames
         agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
+        enough = frames - history.cones >= ENOUGH
         if known < max(FEW, OVERLAP * len(points)):
-            return passed
+            return passed._replace(confirms=enough)
         if agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
             return passed._replace(takes_out=frames, glances=())
-        return passed._replace(confirms=agree >= CONFIRMED * known)
+        return passed._replace(confirms=enough or agree >= CONFIRMED * known)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Inspect the first image, so that kernels compile now and not when a frame is in doubt."""
@@ -209,14 +216,16 @@ class Placed(NamedTuple):
     lengths: NDArray[np.float64]
 
 
-def _placed(voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]) -> Placed:
-    """Return where points (N, 3) in the sensor's frame are in the map."""
+def _placed(
+    voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64], tries: int = 3
+) -> Placed:
+    """Return where points (N, 3) in the sensor's frame are in the map; tries: as for `_on_surface`."""
     if not len(points):
         empty = np.zeros(0, bool)
         return Placed(empty, empty, empty, np.zeros(0))
     rays = points @ T[:3, :3].T
     away = np.linalg.norm(points, axis=1)
-    agrees = _on_surface(voxel_map, T, points, tolerance)
+    agrees = _on_surface(voxel_map, T, points, tolerance, tries)
     first = voxel_map.cast_rays(np.broadcast_to(T[:3, 3], rays.shape), rays, REACH).distance.astype(float)
     gap = away - np.where(np.isfinite(first), first, np.inf)
     through = gap > tolerance + DEEP_CELLS * voxel_map.voxel_size
@@ -227,13 +236,16 @@ def _placed(voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tole
 
 
 def _on_surface(
-    voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64]
+    voxel_map: Surfaces, T: Transform, points: NDArray[np.float64], tolerance: NDArray[np.float64], tries: int = 3
 ) -> NDArray[np.bool_]:
-    """Return which points (..., 3) in the sensor's frame are on a surface, give or take (...) metres along the ray."""
+    """Return which points (..., 3) in the sensor's frame are on a surface, give or take (...) metres along the ray.
+
+    tries: at how many places along it.
+    """
     step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
-    tries = np.stack([points * (1 - step), points, points * (1 + step)])
-    placed = tries.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
-    return np.any(voxel_map.state(placed).reshape(tries.shape[:-1]) >= State.TENTATIVE, axis=0)
+    tried = np.stack([points * (1 + k * step) for k in np.linspace(-1, 1, tries)])
+    placed = tried.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    return np.any(voxel_map.state(placed).reshape(tried.shape[:-1]) >= State.TENTATIVE, axis=0)
 
 
 def _fault(

@@ -38,9 +38,9 @@ CONFIRMED, CONTRADICTED = 0.85, 0.7
 they are taken out, and between both if most is known: from elsewhere, good frames agree less."""
 OVERLAP, MOST = 0.25, 0.5
 """Share of a frame's points that must be known for a judgement, and to count as most."""
-SPREAD, ENOUGH = 3, 10
-"""How many sigma two measurements of a surface may differ, and how many frames that do not contradict each other count
-although none confirms another."""
+SPREAD, BLURRED, ENOUGH = 3, 2, 10
+"""How many sigma two measurements of a surface may differ, noise in cells beyond which they prove little, and how many
+frames that do not contradict each other count although none confirms another."""
 GAIN = 0.1
 """Least share of its points by which a frame must agree better under a fault, however little there is to explain."""
 DEEP_CELLS = 4
@@ -122,20 +122,22 @@ class Comparison:
     def _confirmed(self, image: AnyImage, passed: GateResult, voxel_map: VoxelMap) -> GateResult:
         """Return the result for a frame whose map is of frames that none has confirmed.
 
-        Its points are looked up in any cell, since no cell is certain yet. Those whose noise is wider than a cell prove
-        nothing: neither of two such measurements of a surface need be where the other is.
+        Its points are looked up in any cell, since no cell is certain yet. Blurred ones, whose noise is wider than
+        two cells, contradict nothing: neither of two such measurements of a surface need be where the other is.
         """
         points, history = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), voxel_map.history
         sigma = self._noise[image.camera].sigma(np.linalg.norm(points, axis=1))
-        points, sigma = (thinned(values[sigma <= voxel_map.voxel_size], POINTS) for values in (points, sigma))
-        tolerance, tries = np.maximum(voxel_map.voxel_size, SPREAD * sigma), 1 + 2 * SPREAD
+        sharp = sigma <= BLURRED * voxel_map.voxel_size
+        is_sharp = np.count_nonzero(sharp) >= FEW
+        points, sigma = (thinned(values[sharp] if is_sharp else values, POINTS) for values in (points, sigma))
+        tolerance, tries = np.maximum(voxel_map.voxel_size, (SPREAD if is_sharp else 1) * sigma), 1 + 2 * SPREAD
         with voxel_map.lock:
             placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance, tries), history.frames
         agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
         enough = frames - history.cones >= ENOUGH
         if known < max(FEW, OVERLAP * len(points)):
             return passed._replace(confirms=enough)
-        if agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
+        if is_sharp and agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
             return passed._replace(takes_out=frames, glances=())
         return passed._replace(confirms=enough or agree >= CONFIRMED * known)
 

@@ -15,12 +15,14 @@ from typing import Any, Protocol, TypeVar
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.quality import checked_scan
+from stereovox.depth.ranges import level_range
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Cloud, Frame, Range, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.validate import validate_upright_scan
 from stereovox.integrate.beams import make_beams
+from stereovox.integrate.cones import cone_evidence
 from stereovox.kernels.device import check_on_processor, on_usable_device
 from stereovox.kernels.threads import MapLock, uninterrupted
 from stereovox.mapping.comparison import Comparison
@@ -265,7 +267,7 @@ class Mapper(Aged):
 
 
 class GridMapper(Aged):
-    """Builds a 2-D occupancy grid of a floor from lidar scans and depth images.
+    """Builds a 2-D occupancy grid of a floor from lidar scans, depth images and distances of sonars.
 
     A scan that cannot be trusted is refused and changes nothing but the count of refusals. Poses must be in the map's
     frame; `Track.corrected` brings odometry poses into it.
@@ -302,11 +304,11 @@ class GridMapper(Aged):
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = FloorComparison(self.config, self._intake.gate, isinstance(resume, OccupancyGrid))
 
-    def add(self, frame: Scan | AnyFrame) -> UpdateReport:
+    def add(self, frame: Scan | AnyFrame | Range) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
 
         Args:
-            frame: Lidar scan, or a depth image or stereo pair that is turned into one.
+            frame: Lidar scan, a depth image or stereo pair that is turned into one, or a range.
 
         Returns:
             What the scan changed, or why it was refused. `depth_ms` is the time to prepare the scan.
@@ -316,11 +318,14 @@ class GridMapper(Aged):
         """
         with self._intake.offer(frame) as offer:  # a FrameRefused ends here and becomes the report
             started = perf_counter()
-            scan = checked_scan(frame, self.config) if isinstance(frame, Scan) else self._to_scan(frame)
+            scan = level_range(frame, self.config) if isinstance(frame, Range) else self._to_scan(frame)
             passed = offer.check(scan)
             prepared = perf_counter()
-            evidence = self._beams.evidence(scan, self.map.origin)
-            passed = self._comparison.check(frame, scan, evidence, passed, self.map)
+            if isinstance(scan, Range):  # it is not compared, for it yields to the map
+                evidence = replace(cone_evidence(scan, self.config, self.map.origin), again=passed.repeats)
+            else:
+                evidence = self._beams.evidence(scan, self.map.origin)
+                passed = self._comparison.check(frame, scan, evidence, passed, self.map)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
                 cells = self.map.add(evidence)
@@ -365,7 +370,9 @@ class GridMapper(Aged):
     def close(self) -> None:
         """Do nothing: the whole map is in memory."""
 
-    def _to_scan(self, frame: AnyFrame) -> Scan:
+    def _to_scan(self, frame: Scan | AnyFrame) -> Scan:
+        if isinstance(frame, Scan):
+            return checked_scan(frame, self.config)
         from stereovox.depth.scan import check_floor, scan_of
 
         image = self._depth.image(self._depth.matched(frame))

@@ -16,13 +16,14 @@ from stereovox.frame import Reason, Scan, StereoFrame
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import look_at, rotation_matrix
 from stereovox.mapper import GridMapper
-from stereovox.mapping.entrance import CLOUD, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, RANGE, SCAN
+from stereovox.mapping.entrance import CLOUD, FLOOR_RANGE, IMAGE, IMAGE_SCAN, PAIR, PAIR_SCAN, RANGE, SCAN
 from stereovox.maps.record.history import DisagreementSpell
 
 CAMERA = sv.PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.1)
 WALL_M = 1.0
 SETTINGS: dict[str, Any] = {"voxel_size": 0.1, "max_range": 5.0, "stereo.disparities": 16}
-GRIDS = SCAN, IMAGE_SCAN, PAIR_SCAN
+GRIDS = SCAN, IMAGE_SCAN, PAIR_SCAN, FLOOR_RANGE
+RANGES = RANGE, FLOOR_RANGE
 MEASURED = {
     IMAGE: "depth",
     PAIR: "left",
@@ -31,6 +32,7 @@ MEASURED = {
     IMAGE_SCAN: "depth",
     PAIR_SCAN: "left",
     RANGE: "distance",
+    FLOOR_RANGE: "distance",
 }
 LOOSE = {
     **{f"stereo.{name}": 0 for name in ("p1", "uniqueness", "speckle_size", "min_confidence", "texture", "left_right")},
@@ -67,6 +69,7 @@ def good(kind: str, n: int = 0, **changes: Any) -> Any:
         IMAGE_SCAN: _image,
         PAIR_SCAN: _pair,
         RANGE: _range,
+        FLOOR_RANGE: _range,
     }[kind](n)
     return replace(made, **changes)
 
@@ -190,14 +193,14 @@ def _scaled(T: np.ndarray) -> np.ndarray:
 def _not_frames(kind: str) -> list[Case]:
     made, name = good(kind), MEASURED[kind]
     masked = replace(made, **{name: np.ma.masked_array(getattr(made, name))})
-    if kind == RANGE:
+    if kind in RANGES:
         masked = replace(made, pose_sigma=(0.0, np.nan))
     more = [] if kind == SCAN else [Case(replace(made, pose_sigma=(-1.0, 0.0)))]
     return [Case("no frame"), Case(None), Case(masked), *more]
 
 
 def _wrong_mapper(kind: str) -> list[Case]:
-    mapper = GridMapper if kind in (CLOUD, RANGE) else sv.Mapper
+    mapper = GridMapper if kind == CLOUD else sv.Mapper
     return [Case(made, mapper=mapper) for made in (good(kind), good(kind, name=np.zeros(0)))]
 
 
@@ -254,7 +257,7 @@ def _unit(kind: str) -> list[Case]:
 
 
 def _nothing_left(kind: str) -> list[Case]:
-    if kind == RANGE:
+    if kind in RANGES:
         return [Case(good(kind, distance=value)) for value in (np.nan, -np.inf, np.inf, 0.1, 4.1, 1500.0, -1.0)]
     if MEASURED[kind] == "left":
         return [Case(good(kind, left=np.full((48, 64), 128, np.uint8), right=np.full((48, 64), 128, np.uint8)))]
@@ -393,7 +396,7 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("no_surfaces", 0): _random,
     ("too_dark", 0): _lit(0),
     ("overexposed", 0): _lit(255),
-    ("tilted", 0): _posed(lambda T: _turned(T, 20, 0)),
+    ("tilted", 0): lambda kind: _posed(lambda T: _turned(T, 20, kind == FLOOR_RANGE))(kind),
     ("camera_tilted", 0): _posed(lambda T: _turned(T, 20, 2), **{"scan.method": "rows"}),
     ("camera_vertical", 0): _down,
     ("below_floor", 0): _posed(lambda T: T, **{"scan.floor": 50.0}),

@@ -7,12 +7,13 @@ zeros. Tests compare the kernels with them, and them with OctoMap.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lidar import RangeSensor
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
@@ -339,4 +340,40 @@ def cone(distance: float, T: NDArray, beam: float, sigma: float, config: Config)
             arc[key] = share
         elif (angle > half).all() or away.min() > distance:
             outside[key] = 0.0
+    return before, arc, outside
+
+
+def flat_cone(
+    distance: float, T: NDArray, beam: RangeSensor, origin: Sequence[float], config: Config
+) -> tuple[dict, dict, dict]:
+    """Return cells of a sonar's reading in a grid: surely before its arc, surely on it, and surely outside.
+
+    Each cell is judged by 20 x 20 points in it, without any ray; those that an edge of the cone cuts are in none. The
+    evidence of the arc is that of one echo from somewhere on it (thousandths), with noise tried by random numbers.
+    """
+    size, half, x, y, yaw = config.voxel_size, beam.beam / 2, *origin
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])  # of the world's axes to the grid's
+    place, ahead = turn @ (T[:2, 3] - [x, y]), turn @ T[:2, 0]
+    shrunk = np.linalg.norm(ahead)  # leaning shortens everything
+    reach = int((distance + 0.5) / size) + 2
+    middle = np.floor(place / size).astype(int)
+    steps = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 20)]), axis=-1).reshape(-1, 2)
+    before, arc, outside = {}, {}, {}
+    at, moved = np.random.default_rng(0).uniform(size=(2, 300_000)), np.random.default_rng(1).normal(size=300_000)
+    stays = np.mean(np.floor(at[0] + moved * beam.sigma / size) == 0)
+    q = 0.9 * stays / max(beam.beam * distance / size, 1.0)
+    p = 0.1 + 0.9 * q
+    value = 800 * (np.log(p / (1 - p)) - np.log(1 / 9))
+    for cell in np.stack(np.meshgrid(*2 * [np.arange(-reach, reach + 1)]), axis=-1).reshape(-1, 2) + middle:
+        arms = ((cell + steps) * size - place) / shrunk
+        away = np.linalg.norm(arms, axis=1)
+        angle = np.abs(np.angle(np.exp(1j * (np.arctan2(arms[:, 1], arms[:, 0]) - np.arctan2(ahead[1], ahead[0])))))
+        edge = size / np.maximum(away, size)
+        within = angle < half - edge
+        if within.all() and beam.range_min < away.min() and away.max() < distance - 4 * beam.sigma:
+            before[tuple(cell.tolist())] = np.log(0.4 / 0.6)
+        elif (np.abs(away - distance) < size / 40)[within].sum() >= 16:
+            arc[tuple(cell.tolist())] = value
+        elif (angle > half + 1e-6).all() or away.min() > distance or away.max() < beam.range_min:
+            outside[tuple(cell.tolist())] = 0.0
     return before, arc, outside

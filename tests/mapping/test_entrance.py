@@ -90,7 +90,7 @@ def test_good_inputs_are_taken(kind):
     for n in range(6):
         report = mapper.add(good(kind, n))
         assert report.refused is None, report.detail
-    least = ("tentative", 5) if kind == "range" else ("occupied", 20)  # an arc is weak, and these are one look
+    least = ("tentative", 5) if kind.startswith("range") else ("occupied", 20)  # an arc is weak, and these are one look
     assert mapper.map.counts()[least[0]] > least[1]
 
 
@@ -121,8 +121,8 @@ def test_a_check_that_is_taken_away_is_missed(check, number, kind, monkeypatch):
 
 SOURCES = Path(sv.__file__).parent
 MAKERS = {
-    "evidence", "scan_evidence", "crossed_cells", "prepare", "checked", "checked_cloud", "checked_scan",
-    "validate_scan", "validate_upright_scan", "check_unit_of_rays", "Mapper", "GridMapper",
+    "evidence", "scan_evidence", "cone_evidence", "crossed_cells", "prepare", "checked", "checked_cloud",
+    "checked_scan", "validate_scan", "validate_upright_scan", "check_unit_of_rays", "Mapper", "GridMapper",
 }  # fmt: skip
 """What is called by whoever turns measurements into evidence, or into a map."""
 INSIDE = ("depth/", "integrate/", "frame/")

@@ -138,7 +138,7 @@ def validate_upright_scan(scan: Scan, config: Config) -> Scan:
     return scan
 
 
-def rigid_pose(frame: Frame | Cloud | Scan, tolerance: float) -> se3.Transform:
+def rigid_pose(frame: Frame | Cloud | Scan | Range, tolerance: float) -> se3.Transform:
     """Return the rigid motion nearest to the pose; `tolerance` is the largest error that is rounded away.
 
     Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_too_far`, `pose_not_rigid`.

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import registry
 from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused
-from stereovox.frame import Scan, name_of
+from stereovox.frame import Range, Scan, name_of
 from stereovox.frame.validate import for_kernels
 from stereovox.geometry import se2
+from stereovox.geometry.se3 import Transform
 from stereovox.integrate import _beams
 from stereovox.maps.cells.evidence import CELLS, SIDE, GridEvidence, to_units
 from stereovox.maps.voxel_map import INDEX_LIMIT
@@ -93,11 +94,7 @@ class Beams:
         size, config = self._config.voxel_size, self._config
         ranges, clear, clear_from = _beams_of(scan)
         T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
-        position = T[:2, 3] / size
-        if not ((np.abs(position) < INDEX_LIMIT - 2 * MAX_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
-            raise FrameRefused(
-                "pose_too_far", f"{name_of(scan)}: it is more than {INDEX_LIMIT} cells from the map's origin"
-            )
+        position = check_near(T, size, scan)
         reach = np.fmin(scan.range_max, config.max_range)
         with np.errstate(over="ignore"):
             limits = np.array([scan.range_min, reach, scan.range_max], np.float32)
@@ -128,6 +125,16 @@ class Beams:
         coords, values = self._coords[:tiles], self._values[:tiles]
         _beams.lay_out(low, across, coords, values)
         return coords, values
+
+
+def check_near(T: Transform, size: float, seen: Scan | Range) -> NDArray[np.float64]:
+    """Return the place (2,) in cells of a sensor at T in the grid. Raises FrameRefused `pose_too_far`."""
+    position = T[:2, 3] / size
+    if not ((np.abs(position) < INDEX_LIMIT - 2 * MAX_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
+        raise FrameRefused(
+            "pose_too_far", f"{name_of(seen)}: it is more than {INDEX_LIMIT} cells from the map's origin"
+        )
+    return position
 
 
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:

@@ -134,7 +134,7 @@ class Comparison:
         with voxel_map.lock:
             placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance, tries), history.frames
         agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
-        enough = frames - history.cones >= ENOUGH
+        enough = frames - history.cones.total() >= ENOUGH
         if known < max(FEW, OVERLAP * len(points)):
             return passed._replace(confirms=enough)
         if is_sharp and agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:

@@ -25,8 +25,8 @@ from stereovox.maps.grid_map import GridStorage
 
 IMAGE, PAIR, CLOUD = "depth image", "stereo pair", "cloud"
 SCAN, IMAGE_SCAN, PAIR_SCAN = "2-D scan", "depth image to scan", "stereo pair to scan"
-RANGE = "range"
-KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN, RANGE
+RANGE, FLOOR_RANGE = "range", "range in a grid"
+KINDS = IMAGE, PAIR, CLOUD, SCAN, IMAGE_SCAN, PAIR_SCAN, RANGE, FLOOR_RANGE
 """Kinds of input: the first three and ranges enter a `Mapper`, the others a `GridMapper`."""
 Refuses = Callable[..., Any]
 Cell = Refuses | tuple[Refuses, ...] | str
@@ -49,15 +49,18 @@ class Check(NamedTuple):
     setting: str = ""
 
 
-def _cells(one: Cell, *others: Cell, ranged: Cell | None = None) -> dict[str, Cell]:
+def _cells(one: Cell, *others: Cell, ranged: Cell | None = None, on_floor: Cell | None = None) -> dict[str, Cell]:
     """Return the cells of all kinds: one for all, three (images and pairs, clouds, scans), or six.
 
-    ranged: that of ranges; None: that of the clouds which they become.
+    ranged, on_floor: those of ranges, and of ranges in a grid; None: that of the clouds which they become, and as
+    `ranged` or that of scans.
     """
     if len(others) == 2:
         others = (one, *others, one, one)
     cells = dict(zip(KINDS, (one, *others) if others else [one] * 6, strict=False))
-    return {**cells, RANGE: cells[CLOUD] if ranged is None else ranged}
+    cells[RANGE] = cells[CLOUD] if ranged is None else ranged
+    cells[FLOOR_RANGE] = on_floor or (cells[SCAN] if ranged is None else ranged)
+    return cells
 
 
 METRES = "its numbers are metres by definition; see `bad_units`"
@@ -80,7 +83,7 @@ CHECKS = (
     Check("bad_form", "the mapper does not accept this kind",
           _cells(ANY_MAPPER, ANY_MAPPER, 
                  (DepthPipeline.matched, validate.validate_fields, validate._check_fields), validate.validate_fields,
-                 ANY_MAPPER, ANY_MAPPER, ranged=validate.validate_fields)),
+                 ANY_MAPPER, ANY_MAPPER, ranged=ANY_MAPPER)),
     Check("bad_stamp", "a stamp is no int64", _cells(validate._check_fields)),
     Check("bad_sensor", "the sensor's name is not text", _cells(validate._check_fields)),
     Check("bad_sensor", "the sensor's name is not printable, or longer than 256 characters",
@@ -106,21 +109,22 @@ CHECKS = (
           _cells(BY_CAMERA, cloud._points, "see `too_many_beams`",
                  ranged="as many rays as its cone needs are made here")),
     Check("too_many_beams", "a scan has over 65,536 beams",
-          _cells(BY_CAMERA, "see `too_many_points`", beams._beams_of)),
-    Check("bad_scan", "angles or limits are invalid", _cells(BY_CAMERA, NO_PIXELS, validate.validate_scan)),
+          _cells(BY_CAMERA, "see `too_many_points`", beams._beams_of, on_floor="see `too_many_points`")),
+    Check("bad_scan", "angles or limits are invalid",
+          _cells(BY_CAMERA, NO_PIXELS, validate.validate_scan, on_floor="a `RangeSensor` cannot have others")),
     Check("bad_clear", "`clear` or `clear_from` has the wrong length",
           _cells("it has none", "see `bad_shape`", beams._beams_of, ranged="it has none")),
     Check("no_pose", "there is no pose", _cells(validate.rigid_pose)),
     Check("pose_not_finite", "the pose holds NaN or infinity", _cells(validate._check_place)),
     Check("pose_too_far", "the position is 1000 km or more from the origin", _cells(validate._check_place)),
     Check("pose_too_far", "it is more than about 2^30 cells from the map's origin",
-          _cells(*[views.check_place] * 3, *[beams.Beams._aim] * 3)),
+          _cells(*[views.check_place] * 3, *[beams.check_near] * 3)),
     Check("pose_not_rigid", "the pose is a mirror, a scale or a shear", _cells(validate.rigid_pose),
           "pose_rigidity_tolerance"),
     Check("mount_not_rigid", "the lidar's mount on the robot is no rigid motion",
-          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount)),
+          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount, on_floor=OWN_POSE)),
     Check("mount_too_far", "the lidar's mount is 1000 km or more from the robot",
-          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount)),
+          _cells(OWN_POSE, OWN_POSE, validate._rigid_mount, on_floor=OWN_POSE)),
     Check("pose_extrapolated",
           "its pose is more than 0.05 s away from the nearest measured one (`pose_off_ns`)", _cells(Gate._identify),
           "trust.max_pose_off_s"),
@@ -141,7 +145,7 @@ CHECKS = (
     Check("no_valid_point", "not one ray can be used",
           _cells("see `no_valid_depth`", cloud.checked_cloud, "see `no_valid_range`", ranged=ONE_NUMBER)),
     Check("no_valid_range", "not one beam has a range, or nothing was heard, which clears nothing (`silence_clears`)",
-          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan, ranged=ranges.cloud_of)),
+          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan, ranged=ranges.distance_of)),
     Check("too_few_values", "less than 0.5 % of the pixels, points or beams have a value or are too far",
           _cells(quality._check_share, quality._check_number, quality._check_number,
                  ranged=ONE_NUMBER), "trust.min_valid_share"),
@@ -153,7 +157,8 @@ CHECKS = (
     Check("overexposed", "90 % of an image is saturated",
           _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
     Check("tilted", "the lidar leans by more than 5 degrees, so its beams meet the floor",
-          _cells(SPACE, SPACE, SPACE, validate.validate_upright_scan, "see `camera_tilted`", "see `camera_tilted`"),
+          _cells(SPACE, SPACE, SPACE, validate.validate_upright_scan, "see `camera_tilted`", "see `camera_tilted`",
+                 on_floor=ranges.level_range),
           "grid.max_tilt_deg"),
     Check("camera_tilted", "no row of the image is level (method `rows`; `cloud` accepts any attitude)",
           _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.level_rows, scan.level_rows), "scan.off_level_deg"),

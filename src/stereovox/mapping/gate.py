@@ -93,7 +93,7 @@ class Gate:
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan | Range, image: AnyImage | Scan) -> GateResult:
+    def check(self, frame: AnyFrame | Scan | Range, image: AnyImage | Scan | Range) -> GateResult:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -123,9 +123,13 @@ class Gate:
         return self._history.doubts.get(passed.sensor)
 
     def others_apart(self, passed: GateResult, metres: float) -> bool:
-        """Return whether the last trusted frame of any other sensor was more than `metres` higher or lower."""
-        trusted, height = self._history.trusted, passed.seen.pose[11]
-        return any(abs(one.pose[11] - height) > metres for name, one in trusted.items() if name != passed.sensor)
+        """Return whether the last trusted frame of any other sensor was more than `metres` higher or lower.
+
+        Cones do not count: no cell is surely occupied by them alone, so they contradict nobody.
+        """
+        height, ignored = passed.seen.pose[11], {passed.sensor, *self._history.cones}
+        trusted = self._history.trusted.items()
+        return any(abs(one.pose[11] - height) > metres for name, one in trusted if name not in ignored)
 
     def check_agreement(
         self, frame: AnyFrame | Scan | Range, passed: GateResult, against: float | None, sight: Sight | None
@@ -147,7 +151,8 @@ class Gate:
             self._history.glances[passed.sensor] = passed.glances
         if passed.agreement is not None:
             self._monitor.accept(passed.sensor, passed.agreement)
-        self._history.cones += passed.is_cone
+        if passed.is_cone:
+            self._history.cones[passed.sensor] += 1
         if passed.confirms:
             self._history.unconfirmed = 0
         if passed.after:

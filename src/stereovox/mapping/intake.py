@@ -139,7 +139,7 @@ class PendingFrame:
         finally:
             self._intake._adding.release()
 
-    def check(self, image: AnyImage | Scan) -> GateResult:
+    def check(self, image: AnyImage | Scan | Range) -> GateResult:
         """Check the frame, the source of `image`, and return what `accept` needs. Raises as `Gate.check`."""
         intake = self._intake
         with intake._map.lock:

@@ -133,6 +133,8 @@ class GridStorage(Guarded):
     def add(self, evidence: GridEvidence) -> int:
         """Add the evidence of one scan (IST 2019, Eq 5); return the number of cells whose value changed."""
         values = evidence.values
+        if evidence.weak:
+            values = self.rules.yielding(values, self._cells_of(evidence.coords), evidence.again)
         if self.cell_format.per_log_odds != LOG_ODDS_SCALE:
             factor, shift = self.cell_format.per_log_odds / LOG_ODDS_SCALE, self.cell_format.shift(self.history.frames)
             values = np.floor(values * factor + shift).astype(np.int32)
@@ -144,6 +146,14 @@ class GridStorage(Guarded):
             pool.table, pool.coords, pool.count, pool.values, evidence.coords, values,
             np.int32(self.cell_format.unknown), rules.prior, rules.lowest, rules.highest,
         )  # fmt: skip
+
+    def _cells_of(self, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 4096) of tiles (n, 3) as stored."""
+        places = np.empty(len(coords), np.int64)
+        _pool.find_all(self._pool.table, self._pool.coords, coords, places)
+        cells = np.full((len(coords), CELLS), self.cell_format.unknown, self.cell_format.dtype)
+        cells[places >= 0] = self._pool.values[places[places >= 0]]
+        return cells
 
     def stored_at(self, indices: NDArray[np.integer]) -> NDArray[np.integer]:
         """Return the stored numbers (N,) of cells, column and row (N, 2); "unknown" if there is no tile."""

@@ -40,7 +40,11 @@ class Arc:
     def hit(self, z_measured: Array, sigma: Array, voxel_size: float) -> Array:
         """Return the probability of each cell of the arc, at even prior odds."""
         cells = np.maximum(self.solid_angle * (np.asarray(z_measured) / voxel_size) ** 2, 1.0)
-        q = self.p_right * stays(np.asarray(sigma) / voxel_size) / cells
+        return self.shared(cells, np.asarray(sigma) / voxel_size)
+
+    def shared(self, cells: Array, sigma: Array) -> Array:
+        """Return the same for an arc of so many cells, and noise in cells."""
+        q = self.p_right * stays(sigma) / cells
         p = self.prior + q - self.prior * q
         evidence = self.trust * (np.log(p / (1 - p)) - np.log(self.prior / (1 - self.prior)))
         return 1 / (1 + np.exp(-np.maximum(evidence, LEAST)))

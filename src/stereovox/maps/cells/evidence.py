@@ -22,11 +22,14 @@ class GridEvidence:
         nothing.
     ends: (N, 6) of each beam of the scan from where and up to where it clears, and where it hits, x and y in cells of
         the grid; NaN for nothing. None if unknown.
+    weak, again: as in `Evidence`.
     """
 
     coords: NDArray[np.int32]
     values: NDArray[np.signedinteger]
     ends: NDArray[np.float64] | None = None
+    weak: bool = False
+    again: bool = False
 
     @classmethod
     def nothing(cls) -> GridEvidence:

@@ -133,7 +133,7 @@ class History:
         recordings: Number of recordings that were merged by their given poses; 1 without a merge, or if `join` made
             one path of them, which it can if they were recorded one after the other.
         unconfirmed: How often the map may still begin anew with a frame that contradicts it; 0 once two frames agreed.
-        cones: How many of the frames are distances of sonars and the like, which are not compared.
+        cones: How many of the frames are distances of sonars and the like, which are not compared, by sensor.
     """
 
     frames: int = 0
@@ -153,7 +153,7 @@ class History:
     loops: LoopLines | None = None
     recordings: int = 1
     unconfirmed: int = 0
-    cones: int = 0
+    cones: Counter[str] = field(default_factory=Counter)
 
     def made_of(self) -> str:
         """Return lines for people: the recording, or the imported file and the notes about it, or both."""
@@ -177,14 +177,23 @@ class History:
     @property
     def is_provisional(self) -> bool:
         """Whether it has frames that could agree, and no two of them have."""
-        return self.frames > self.cones and self.unconfirmed > 0
+        return self.frames > self.cones.total() and self.unconfirmed > 0
 
     def begin_anew(self) -> None:
         """Count all frames as refused, and forget their sensors."""
         for _ in range(self.frames):
             self.refuse(UNCONFIRMED)
-        self.frames, self.cones, self.path, self.unconfirmed = 0, 0, CameraPath(), self.unconfirmed - 1
-        for remembered in (self.quality, self.trusted, self.waiting, self.looks, self.usual, self.doubts, self.glances):
+        self.frames, self.path, self.unconfirmed = 0, CameraPath(), self.unconfirmed - 1
+        for remembered in (
+            self.cones,
+            self.quality,
+            self.trusted,
+            self.waiting,
+            self.looks,
+            self.usual,
+            self.doubts,
+            self.glances,
+        ):
             remembered.clear()
 
     def copied(self) -> History:
@@ -214,7 +223,7 @@ class History:
                 "doubts": {name: _doubt_to(doubt) for name, doubt in self.doubts.items()},
                 "glances": {name: [_glance_to(one) for one in seen] for name, seen in self.glances.items()},
                 "unconfirmed": self.unconfirmed,
-                "cones": self.cones,
+                "cones": dict(self.cones),
             },
             "camera_path": self.path.saved(),
             "loops": None if self.loops is None else self.loops.saved(),
@@ -251,7 +260,7 @@ class History:
             name: _glances_from(seen) for name, seen in _sensors(entries.get("glances", {})).items()
         }
         history.unconfirmed = _whole(entries.get("unconfirmed", 0), "history.unconfirmed")
-        history.cones = _whole(entries.get("cones", 0), "history.cones")
+        history.cones = _counts(entries.get("cones", {}), "cones")
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, but its reasons add up to {history.refused.total()}")
         return history

@@ -327,19 +327,12 @@ class Storage(Guarded):
         return cells
 
     def _yielding(self, evidence: Evidence) -> Evidence:
-        """Return weak evidence without what would clear a surely occupied cell, or add to an occupied one.
-
-        Of evidence that repeats, only what is for something in a free cell.
-        """
-        stored = self.cells_of(evidence.coords).astype(np.int32)
-        if evidence.again:
-            free = (stored <= self.rules.thresholds.free_most) & (stored != self.cell_format.unknown)
-            values = np.where(free & (evidence.values > 0), evidence.values, np.int16(0))
-            some = values.any(axis=1)
-            return Evidence(evidence.coords[some], values[some], evidence.uniform[:0], evidence.uniform_values[:0])
-        occupied, sure = stored >= self.rules.thresholds.occupied_least, stored >= self.rules.sure[2]
-        against = (evidence.values > 0) & occupied | (evidence.values < 0) & sure
-        return replace(evidence, values=np.where(against, np.int16(0), evidence.values))
+        """Return what is left of weak evidence (`CellRules.yielding`); no whole blocks of evidence that repeats."""
+        values = self.rules.yielding(evidence.values, self.cells_of(evidence.coords), evidence.again)
+        if not evidence.again:
+            return replace(evidence, values=values)
+        some = values.any(axis=1)
+        return Evidence(evidence.coords[some], values[some], evidence.uniform[:0], evidence.uniform_values[:0])
 
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""

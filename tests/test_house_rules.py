@@ -23,8 +23,8 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 609,
-    "lines": 92_650,
+    "modules": 610,
+    "lines": 92_800,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

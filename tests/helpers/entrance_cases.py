@@ -396,7 +396,7 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
     ("no_surfaces", 0): _random,
     ("too_dark", 0): _lit(0),
     ("overexposed", 0): _lit(255),
-    ("tilted", 0): lambda kind: _posed(lambda T: _turned(T, 20, kind == FLOOR_RANGE))(kind),
+    ("tilted", 0): lambda kind: _posed(lambda T: _turned(T, 20, int(kind == FLOOR_RANGE)))(kind),
     ("camera_tilted", 0): _posed(lambda T: _turned(T, 20, 2), **{"scan.method": "rows"}),
     ("camera_vertical", 0): _down,
     ("below_floor", 0): _posed(lambda T: T, **{"scan.floor": 50.0}),

@@ -57,7 +57,7 @@ def _cells(one: Cell, *others: Cell, ranged: Cell | None = None, on_floor: Cell 
     """
     if len(others) == 2:
         others = (one, *others, one, one)
-    cells = dict(zip(KINDS, (one, *others) if others else [one] * 6, strict=False))
+    cells: dict[str, Cell] = dict(zip(KINDS, (one, *others) if others else [one] * 6, strict=False))
     cells[RANGE] = cells[CLOUD] if ranged is None else ranged
     cells[FLOOR_RANGE] = on_floor or (cells[SCAN] if ranged is None else ranged)
     return cells

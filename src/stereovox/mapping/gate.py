@@ -110,7 +110,7 @@ class Gate:
         if passed.after:
             self._history.doubts.pop(sensor, None)  # they were about another place or another time
             self._history.glances.pop(sensor, None)
-        if self._trust.frozen and not isinstance(image, Scan):
+        if self._trust.frozen and not isinstance(image, Scan | Range):
             return passed._replace(glances=self._glances(frame, passed, image))
         return passed
 

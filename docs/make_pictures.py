@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
+from stereovox import load_config
 from stereovox.cli import main as stereovox
 
 HERE = Path(__file__).resolve().parent
@@ -26,13 +27,14 @@ OPTICAL = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
 
 
 def main() -> None:
-    """Draw all five."""
+    """Draw all six."""
     demo()
     loops()
     plt.rcParams.update({"font.size": 11, "text.color": INK, "svg.fonttype": "path", "svg.hashsalt": "stereovox"})
     save(frames(), "frames.svg")
     save(cells_and_pixels(), "cells.svg")
     save(changed_world(), "changed_world.svg")
+    save(decision(), "decision.svg")
 
 
 def changed_world() -> plt.Figure:
@@ -60,6 +62,27 @@ def changed_world() -> plt.Figure:
             panel.plot(*points.T, ".", color=colour, ms=8)
         panel.set(title=title, xlim=(-1.5, 2.5), ylim=(-0.3, 3.4), aspect="equal")
         panel.axis("off")
+    return figure
+
+
+def decision() -> plt.Figure:
+    """Draw what each decision costs by a cell's probability, with the default's costs, and which costs least."""
+    figure, axes = plt.subplots(figsize=(8, 3.2), facecolor=PAPER, layout="constrained")
+    rules, p = load_config().map, np.linspace(0, 1, 401)
+    free, occupied = rules.decision
+    costs = {
+        f"free: {rules.missed_obstacle:g} p": (rules.missed_obstacle * p, Y),
+        "tentative: 1": (np.ones_like(p), INK),
+        f"occupied: {rules.false_alarm:g} (1 - p)": (rules.false_alarm * (1 - p), X),
+    }
+    for label, (cost, colour) in costs.items():
+        axes.plot(p, cost, color=colour, label=label)
+    for (low, high), (_, colour) in zip(((0, free), (free, occupied), (occupied, 1)), costs.values(), strict=True):
+        axes.axvspan(low, high, color=colour, alpha=0.12, lw=0)
+    axes.set(xlim=(0, 1), ylim=(0, 1.6), xlabel="p, the probability that the cell is occupied", ylabel="cost")
+    axes.set_xticks([0, free, occupied, 0.5, 1], ["0", f"{free:.3f}", f"{occupied:.3f}", "0.5", "1"])
+    axes.set_facecolor(PAPER)
+    axes.legend(frameon=False, loc="upper right")
     return figure
 
 

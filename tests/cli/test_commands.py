@@ -431,9 +431,9 @@ def test_a_map_without_an_occupied_cell_asks_for_the_range(recording, tmp_path, 
     far = ["--set", "window.size=[4,4,4]", "--set", "window.centre=[90,0,0]"]
     assert run(*common[:2], "--out", tmp_path / "far", "--voxel-size", 0.1, *far) == 0
     assert "the camera was never in the box" in capsys.readouterr().err
-    unsure = ["--frames", ":1", "--set", "map.prior=0.001"]
+    unsure = ["--frames", ":1", "--set", "map.false_alarm=1e6"]
     assert run(*common[:2], "--out", tmp_path / "unsure", "--voxel-size", 0.1, *unsure) == 0
-    assert "are tentative; is --max-range large enough, map.prior too low?" in capsys.readouterr().err
+    assert "are tentative; is --max-range large enough, map.false_alarm too large?" in capsys.readouterr().err
 
 
 KINDS = ("wall", "noise", "pair", "stereo", "import")

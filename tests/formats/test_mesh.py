@@ -63,7 +63,7 @@ def test_a_box_has_an_outer_and_an_inner_surface():
     seen = solid_of(box(outside=True))
     assert seen.is_watertight
     assert seen.body_count == 2
-    assert np.ptp(seen.vertices, axis=0).max() < 1.0
+    assert np.ptp(seen.vertices, axis=0).max() < 1.0 + 2 * 0.02  # p = 0.29 lies a little outside the cells' faces
     unseen = solid_of(box(outside=False))
     assert unseen.is_watertight
     assert unseen.bounds.min() >= -0.3 - 1e-6  # towards the unknown never beyond the cells' own faces

@@ -122,6 +122,18 @@ def test_states_keep_their_class_under_unusual_thresholds(tmp_path):
     assert read_octomap(tmp_path / "low.bt").counts() == {"free": 1, "tentative": 0, "occupied": 1}
 
 
+def test_programs_that_take_all_above_one_half_as_occupied_meet_every_occupied_cell(tmp_path):
+    """By default a cell is occupied from p = 0.286 on; OctoMap's own threshold is a log-odds of 0."""
+    config = load_config(voxel_size=0.1)
+    occupied = VoxelMap.from_cells(config, [[0, 0, 0]], [-0.9])
+    assert occupied.counts()["occupied"] == 1
+    for ending in (".bt", ".ot"):
+        export(occupied, tmp_path / f"one{ending}")
+        again = read_octomap(tmp_path / f"one{ending}")
+        assert cells_of(again)[0, 0, 0] > 0
+        assert again.counts()["occupied"] == 1
+
+
 @pytest.mark.parametrize("cell", [(32768, 0, 0), (0, -32769, 0)])
 def test_cells_beyond_octomaps_reach(tmp_path, cell):
     (tmp_path / "far.bt").write_text("old")

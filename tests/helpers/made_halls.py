@@ -17,7 +17,7 @@ def hall(occupied=(), unknown=(), tentative=(), size=6.0, height=1.5, up="z"):
     cells = np.indices(2 * n).reshape(3, -1).T - n
     odds, keep = np.full(len(cells), -3.0), np.ones(len(cells), bool)
     centres = (cells + 0.5) * CELL
-    for boxes, value in ((occupied, 3.0), (tentative, 0.1), (unknown, None)):
+    for boxes, value in ((occupied, 3.0), (tentative, -1.5), (unknown, None)):
         for low, high in boxes:
             inside = ((centres > low) & (centres < high)).all(axis=1)
             if value is None:

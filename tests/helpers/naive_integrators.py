@@ -86,15 +86,20 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
     Cells that hold a measured point get the hit evidence at their centre's depth: in full where `full_share` of their
     footprint measures a depth within half a cell, with less by the square root of the part. Other cells get the
     positive evidence of the pixel at their centre where there is any, else the negative evidence of how far
-    one sees through a window about their own size.
+    one sees through a window about their own size, of which only `edge_share` counts unless they lie plainly before
+    everything in an area about twice as wide.
     """
     table = _table(image, config, sensor)
     hits, hit_evidence = _weighed(np.unique(_hit_cells(image, config), axis=0), image, config, table)
     cells = _cells_in_range(image, config)
     pixels, z, size_px, seen = _projected(cells, image, config)
     cells, pixels, z, size_px = cells[seen], pixels[seen], z[seen], size_px[seen]
-    clear = np.minimum(_look_up(table, z, _farthest_in_window(image, pixels, size_px), config), 0)
-    clear = np.maximum(clear, table.passed[_row(table, _depth_of_block(cells, image, config))])
+    farthest, nearest = _window(image, pixels, size_px)
+    clear = np.minimum(_look_up(table, z, farthest, config), 0)
+    least = table.passed[_row(table, _depth_of_block(cells, image, config))]
+    plain = (farthest > 0) & (z < _plainly_free_to(table, nearest, config))
+    at_edge = np.floor(1000 * config.projective.edge_share * least) / 1000
+    clear = np.where(plain, least, np.maximum(clear, at_edge))
     mark = np.maximum(_look_up(table, z, _at_centre(image, pixels), config), 0)
     beside = np.where(mark > 0, mark, np.where(z > config.blind, clear, 0))
     return _strongest(np.concatenate([hits, cells]), np.concatenate([hit_evidence, beside]))
@@ -246,30 +251,49 @@ def _pixels_at(x: NDArray, y: NDArray, z: NDArray, image: DepthImage, config: Co
     return uv, camera.fx * config.voxel_size / z
 
 
-def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDArray:
-    """Return the farthest (N,) of the 3x3 tiles about the pixel; tiles of a power of two near 0.27 cell sizes.
+def _window(image: DepthImage, uv: NDArray, size_px: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the farthest (N,) of the 3x3 tiles about the pixel, and the nearest pixel (N,) in 3x3 tiles twice as wide.
 
-    Cells much smaller than a pixel take the pixel itself. Depths that see nothing are infinite; no value is 0.
+    Tiles are of a power of two near 0.27 cell sizes. Cells much smaller than a pixel take the pixel itself. Depths that
+    see nothing are infinite; no value is 0 for the farthest, and left out for the nearest.
     """
     depth = np.where(image.depth_m > 0, image.depth_m, 0).astype(float)
     height, width = depth.shape
-    tiles = [depth, depth]
+    tiles, open_ones, nearest_ones = [depth, depth], depth > 0, np.where(depth > 0, depth, np.inf)
     for _ in range(1, MAX_LEVEL):
-        tiles.append(_seen_through(tiles[-1]))
+        open_ones = _quarters(open_ones).sum(axis=0) >= 2
+        nearest_ones = _quarters(nearest_ones).min(axis=0)
+        tiles.append(np.where(open_ones, nearest_ones, 0))
     level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, MAX_LEVEL).astype(int)
     u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
-    farthest = depth[v, u]
-    for i in np.flatnonzero(level > 0):
-        row, column = v[i] >> (level[i] - 1), u[i] >> (level[i] - 1)
-        farthest[i] = tiles[level[i]][max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].max()
-    return farthest
+    farthest, nearest = depth[v, u], np.empty(len(uv))
+    for i, own in enumerate(level):
+        if own > 0:
+            farthest[i] = _around(tiles[own], v[i] >> (own - 1), u[i] >> (own - 1)).max()
+        side = 2 ** (min(own + 1, MAX_LEVEL) - 1)
+        rows, columns = (slice(max(at // side - 1, 0) * side, (at // side + 2) * side) for at in (v[i], u[i]))
+        some = depth[rows, columns]
+        nearest[i] = some[some > 0].min(initial=np.inf)
+    return farthest, nearest
 
 
-def _seen_through(depth: NDArray) -> NDArray:
-    """Return the nearest of each 2x2 of an image; 0 where three of them or more are 0, which otherwise do not count."""
-    padded = np.pad(depth, [(0, size % 2) for size in depth.shape], mode="edge")
-    parts = np.sort([padded[y::2, x::2] for y in (0, 1) for x in (0, 1)], axis=0)
-    return np.where(parts[0] > 0, parts[0], np.where(parts[1] > 0, parts[1], parts[2]))
+def _around(image: NDArray, row: int, column: int) -> NDArray:
+    return image[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+
+
+def _plainly_free_to(table: SensorTable, nearest: NDArray, config: Config) -> NDArray:
+    """Return the depth (N,) up to which any measurement of at least `nearest` says plainly "free"."""
+    reach = REACH_SIGMA * table.sigma
+    to_rows = np.append(np.arange(ROWS) / table.rows_per_metre - reach, config.max_range)
+    row = _row(table, np.minimum(nearest, config.max_range))
+    later = np.array([to_rows[r + 1 :].min() for r in row])
+    return np.where(np.isfinite(nearest), np.minimum(nearest - reach[row], later), np.inf)
+
+
+def _quarters(image: NDArray) -> NDArray:
+    """Return the four parts (4, rows, columns) of each 2x2 of an image, whose last row and column count twice."""
+    padded = np.pad(image, [(0, size % 2) for size in image.shape], mode="edge")
+    return np.array([padded[y::2, x::2] for y in (0, 1) for x in (0, 1)])
 
 
 def _at_centre(image: DepthImage, uv: NDArray) -> NDArray:

@@ -55,6 +55,20 @@ def test_projective_equals_its_reference(model, voxel_size):
         assert share_that_differs(ours, theirs) < 0.02
 
 
+@pytest.mark.parametrize("voxel_size", SIZES)
+def test_next_to_an_edge_only_a_share_counts_as_in_the_reference(voxel_size):
+    config = load_config(voxel_size=voxel_size, max_range=2.5, **{"projective.edge_share": 0.25})
+    image = made_image(4)
+    ours = cells_of(make_integrator(config).evidence(image))
+    theirs = reference_of(naive_integrators.project, image, config)
+    whole = cells_of(make_integrator(load_config(config, **{"projective.edge_share": 1.0})).evidence(image))
+    less = sum(whole[cell] < ours[cell] < 0 for cell in ours)
+    assert 30 < less < len(ours)  # some of both kinds
+    assert ours.keys() == whole.keys()
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+    assert share_that_differs(ours, theirs) < 0.02
+
+
 @pytest.mark.parametrize("model", SENSORS)
 def test_lone_far_pixels_mark_and_clear_as_in_the_reference(model):
     """They clear nothing as wide as a patch, yet `andert` and `valenti` mark cells next to their points."""

@@ -77,7 +77,7 @@ print(json.dumps({
 def run(program, data=b"", **environment):
     kept = {name: value for name, value in os.environ.items() if name not in ENVIRONMENT}
     command = [sys.executable, "-B", "-c", program]
-    done = subprocess.run(command, env={**kept, **environment}, input=data, capture_output=True, timeout=300)
+    done = subprocess.run(command, env={**kept, **environment}, input=data, capture_output=True, timeout=1800)
     assert done.returncode == 0, done.stderr.decode()
     return json.loads(done.stdout)
 

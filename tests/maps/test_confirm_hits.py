@@ -33,7 +33,7 @@ def frames_until_occupied(one, thousandths, most=300):
 
 @pytest.mark.parametrize(("cell", "hits"), [
     ("int16", 1), ("int16", 2), ("int16", 3), ("int16", 7), ("int16", 50),
-    ("int8", 2), ("int8", 3), ("int8", 9), ("uint8", 2), ("uint8", 3), ("uint8", 10),
+    ("int8", 2), ("int8", 3), ("int8", 7), ("uint8", 2), ("uint8", 3), ("uint8", 10),
 ])  # fmt: skip
 @pytest.mark.parametrize("prior", [0.1, 0.5])
 def test_as_many_frames_as_asked_for(cell, hits, prior):
@@ -44,7 +44,7 @@ def test_as_many_frames_as_asked_for(cell, hits, prior):
 
 
 @pytest.mark.parametrize("cell", UNITS)
-@pytest.mark.parametrize("hits", [2, 5, 40, 90])
+@pytest.mark.parametrize("hits", [2, 5, 20, 39])
 def test_never_fewer_whatever_else_is_said(cell, hits):
     one = VoxelMap(load_config(**rules(cell, hits)))
     random = np.random.default_rng(hits)
@@ -68,7 +68,7 @@ def test_equals_plain_numbers(cell):
     per_log_odds, unknown = UNITS[cell]
     limits = int(CellRules(config.map).lowest), int(CellRules(config.map).highest)
     start = max(round(unknown + log(0.1 / 0.9) * per_log_odds), limits[0])
-    threshold = unknown + floor(round(log(0.7 / 0.3) * per_log_odds, 6)) + 1
+    threshold = unknown + floor(round(log(0.4) * per_log_odds, 6)) + 1  # 1.4 (1 - p) < 1
     most = -(-(threshold - start) // 3)
     numbers = [unknown] * 512
     for frame in range(12):
@@ -104,7 +104,7 @@ def test_grids_need_as_many(cell, hits):
 
 @pytest.mark.parametrize(("cell", "prior", "hits"), [("int8", 0.1, 100), ("uint8", 0.5, 60), ("int16", 0.8, 2)])
 def test_more_hits_than_numbers_can_count_are_one_line(cell, prior, hits):
-    config = load_config(**rules(cell, hits, prior=prior))
+    config = load_config(**rules(cell, hits, prior=prior, free_below=0.3, occupied_above=0.7))
     for make in (VoxelMap, lambda config: GridMap(load_config(config, **{"grid.prior": prior}))):
         with pytest.raises(ConfigError, match=r"map\.confirm_hits .* ask for fewer"):
             make(config)

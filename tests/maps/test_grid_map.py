@@ -242,3 +242,21 @@ def test_a_map_too_large_for_a_picture_says_so():
     with pytest.raises(StereovoxError, match=r"256006 x 256006 m .* does the odometry jump"):
         grid_map.occupancy()
     assert grid_map.memory_bytes < 3e6
+
+
+@pytest.mark.parametrize(
+    "thresholds", [(0.3, 0.7), (1 / 18, 0.4 / 1.4), (9 / 26, 18 / 23), (0.004, 0.996), (0.5, 0.501)]
+)
+def test_messages_say_free_below_30_and_occupied_above_70_whatever_the_thresholds(thresholds):
+    """So a navigation program with thresholds of its own takes each cell as the map does."""
+    percent = np.arange(-1, 101, dtype=np.int8)
+    grid = OccupancyGrid(percent.reshape(6, 17), 0.1, free_below=thresholds[0], occupied_above=thresholds[1])
+    sent, states = grid.message_cells.ravel(), grid.states.ravel()
+    assert sent.dtype == np.int8
+    expected = np.select(
+        [percent < 0, sent < 30, sent <= 70], [State.UNKNOWN, State.FREE, State.TENTATIVE], State.OCCUPIED
+    )
+    np.testing.assert_array_equal(states, expected)
+    assert (np.diff(sent.astype(int)) >= 0).all()
+    if thresholds == (0.3, 0.7):
+        np.testing.assert_array_equal(sent, percent)

@@ -76,7 +76,14 @@ def test_evidence_that_just_undoes_the_prior_is_known():
 @pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
 def test_limits_near_zero_still_tell_known_from_unknown(cell):
     """Limits that round to "unknown" itself are moved one beyond it: every clamped cell stays known, on its side."""
-    narrow = {"map.cell": cell, "map.log_odds_min": -1e-5, "map.log_odds_max": 1e-5, "map.prior": 0.5}
+    narrow = {
+        "map.cell": cell,
+        "map.log_odds_min": -1e-5,
+        "map.log_odds_max": 1e-5,
+        "map.prior": 0.5,
+        "map.free_below": 0.3,
+        "map.occupied_above": 0.7,
+    }
     voxel_map = VoxelMap(load_config(CONFIG, **narrow))
     voxel_map.add(evidence_of([[0, 0, 0]], [np.tile([-900, 900], 256)], [[1, 0, 0]], -900))
     low = voxel_map.log_odds([[0.05, 0.05, 0.05], [0.05, 0.05, 0.15], [0.85, 0.05, 0.05]])
@@ -109,14 +116,14 @@ def test_blocks_without_evidence_are_not_made():
 
 def test_states_and_probabilities():
     cells = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]
-    voxel_map = VoxelMap.from_cells(CONFIG, cells, [-3.0, 0.5, 1.0, 0.0])
+    voxel_map = VoxelMap.from_cells(CONFIG, cells, [-3.0, -1.5, 1.0, 0.0])
     points = voxel_map.centers([*cells, [9, 9, 9]])
-    states = [State.FREE, State.TENTATIVE, State.OCCUPIED, State.TENTATIVE, State.UNKNOWN]
+    states = [State.FREE, State.TENTATIVE, State.OCCUPIED, State.OCCUPIED, State.UNKNOWN]
     assert voxel_map.state(points).tolist() == states
-    assert voxel_map.probability(points)[:3] == pytest.approx(1 / (1 + np.exp([3.0, -0.5, -1.0])), abs=1e-3)
+    assert voxel_map.probability(points)[:3] == pytest.approx(1 / (1 + np.exp([3.0, 1.5, -1.0])), abs=1e-3)
     assert voxel_map.probability(points)[4] == 0.5
-    assert voxel_map.counts() == {"free": 1, "tentative": 2, "occupied": 1}
-    assert voxel_map.occupied() == pytest.approx(np.array([[0.25, 0.05, 0.05]]))
+    assert voxel_map.counts() == {"free": 1, "tentative": 1, "occupied": 2}
+    assert voxel_map.occupied() == pytest.approx(np.array([[0.25, 0.05, 0.05], [0.35, 0.05, 0.05]]))
     assert voxel_map.free() == pytest.approx(np.array([[0.05, 0.05, 0.05]]))
     assert voxel_map.bounds() == pytest.approx(np.array([[0, 0, 0], [0.4, 0.1, 0.1]]))
 

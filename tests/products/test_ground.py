@@ -125,8 +125,8 @@ def test_a_ledge_beside_a_ramp_is_a_step():
     ("heights", "log_odds", "wanted"),
     [
         ((4, 5), 0.0, Footing.UNKNOWN),
-        ((4, 5), 0.3, Footing.TENTATIVE),
-        ((1, 2), 0.3, Footing.DRIVABLE),  # lower than a step: never mind
+        ((4, 5), -1.5, Footing.TENTATIVE),
+        ((1, 2), -1.5, Footing.DRIVABLE),  # lower than a step: never mind
         ((0, 2), 3.0, Footing.DRIVABLE),  # the robot climbs it
         ((12, 13), 3.0, Footing.DRIVABLE),  # above its head
         ((9, 10), 3.0, Footing.OBSTACLE),

@@ -7,7 +7,7 @@ from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.products.path_check import check_path, point_along
 
-FREE, TENTATIVE, OCCUPIED = -3.0, 0.2, 2.0
+FREE, TENTATIVE, OCCUPIED = -3.0, -1.5, 2.0
 
 
 def corridor(changes, **settings):

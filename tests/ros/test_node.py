@@ -176,7 +176,7 @@ def check_grid(message, expected):
     cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
     known = np.argwhere(cells >= 0)
     (bottom, left), (top, right) = known.min(axis=0), known.max(axis=0) + 1
-    np.testing.assert_array_equal(cells[bottom:top, left:right], expected.cells)
+    np.testing.assert_array_equal(cells[bottom:top, left:right], expected.message_cells)
     side, place = message.info.resolution, message.info.origin.position
     assert side == pytest.approx(0.1)
     assert (place.x + left * side, place.y + bottom * side) == pytest.approx(expected.origin[:2], abs=1e-5)

@@ -54,7 +54,7 @@ def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
 
 
 def test_messages_carry_frame_and_time_and_clouds_only_occupied_cells():
-    cells, log_odds = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 9, 9]], [3.0, -3.0, 0.1, 3.0]  # the third is tentative
+    cells, log_odds = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 9, 9]], [3.0, -3.0, -1.5, 3.0]  # the third is tentative
     cloud = cloud_message(VoxelMap.from_cells(load_config(voxel_size=0.1), cells, np.array(log_odds)), 7, "world")
     points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(-1, 4)
     np.testing.assert_allclose(sorted(points[:, 0]), [0.05, 0.95], atol=1e-6)

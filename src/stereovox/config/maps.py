@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ByteSize, ConfigDict, Field, model_validator
 
@@ -11,6 +11,15 @@ from stereovox.config.base import Section
 
 MAX_WINDOW = 1e6
 """Metres along each side of a window."""
+BASE_RATE = 0.1
+"""Share of surfaces among the cells that cameras see, for which costs are thresholds of probability."""
+
+
+class Decision(NamedTuple):
+    """The probabilities below which a cell is free, and above which it is occupied."""
+
+    free_below: float
+    occupied_above: float
 
 
 class SensorConfig(BaseModel):
@@ -43,13 +52,16 @@ class ProjectiveConfig(Section):
 
     full_share: a hit counts in full if at least this share of the cell's footprint in the image measures the cell; a
         smaller share counts as its square root, since a few pixels may be wrong; 0: every hit counts in full.
+    edge_share: a cell that is seen through, but has something nearer within an area about twice as wide, loses only
+        this share of the usual evidence: at edges depths are often wrong. 1: as much as elsewhere.
     """
 
-    full_share: float = Field(0.0, ge=0, le=1)
+    full_share: float = Field(0.05, ge=0, le=1)
+    edge_share: float = Field(0.5, gt=0, le=1)
 
 
 class MapConfig(Section):
-    """Storage of a cell, the range of its log-odds, and the probabilities that separate the states.
+    """Storage of a cell, the range of its log-odds, and the costs of wrong decisions.
 
     cell: `int16` holds thousandths of log-odds, `int8` steps of 1/32 from -4 to 3.97; `uint8` is Chien's byte (2020,
     3.5): 127 unknown, 0 free, 255 occupied.
@@ -60,7 +72,12 @@ class MapConfig(Section):
         at most that fraction.
     keep_times: store when each cell got its last evidence (4 more bytes a cell).
     log_odds_min, log_odds_max: limits of a cell's log-odds.
-    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
+    missed_obstacle, false_alarm: what it costs to call a surface free, and to call air occupied, if leaving a cell
+        tentative costs 1. A cell of probability p is free if p * missed_obstacle < 1, and occupied if
+        (1 - p) * false_alarm < 1: the decision of least expected cost (Berger 1985, 4.4). This holds for a prior of
+        0.1; with another one the thresholds move with it, so that the same evidence decides.
+    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied; not set: by
+        the costs.
     forget_s: a cell without evidence for this many seconds of the recording becomes unknown; needs `keep_times`.
     keep_frames: keep the depth images of all frames in the map, without loss, so that their poses can be corrected
         later (docs/corrections.md).
@@ -72,8 +89,10 @@ class MapConfig(Section):
     log_odds_min: float = Field(-4.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
     prior: float = Field(0.1, gt=0, lt=1)
-    free_below: float = Field(0.3, gt=0, lt=1)
-    occupied_above: float = Field(0.7, gt=0, lt=1)
+    missed_obstacle: float = Field(18.0, gt=1, le=1e6)
+    false_alarm: float = Field(1.4, gt=1, le=1e6)
+    free_below: float | None = Field(None, gt=0, lt=1)
+    occupied_above: float | None = Field(None, gt=0, lt=1)
     confirm_hits: int = Field(1, ge=1, le=100)
     keep_times: bool = False
     forget_s: float | None = Field(None, gt=0)
@@ -82,13 +101,28 @@ class MapConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> MapConfig:
-        if self.free_below >= self.occupied_above:
-            raise ValueError("free_below must be smaller than occupied_above")
+        free_below, occupied_above = self.decision
+        if free_below >= occupied_above:
+            raise ValueError(
+                f"free below {free_below:.3g} and occupied above {occupied_above:.3g}: free_below must be smaller than "
+                "occupied_above, or missed_obstacle and false_alarm larger"
+            )
         if self.forget_s is not None and not self.keep_times:
             raise ValueError("forget_s needs keep_times = true")
         if self.frames_budget is not None and not self.keep_frames:
             raise ValueError("frames_budget needs keep_frames = true")
         return self
+
+    @property
+    def decision(self) -> Decision:
+        """The thresholds that are set, or else follow from the costs."""
+        base = BASE_RATE * (1 - self.prior) / ((1 - BASE_RATE) * self.prior)
+        free, occupied = self.free_below, self.occupied_above
+        if free is None:
+            free = 1 / (1 + base * (self.missed_obstacle - 1))
+        if occupied is None:
+            occupied = 1 - 1 / (1 + (self.false_alarm - 1) / base)
+        return Decision(free, occupied)
 
 
 class WindowConfig(Section):

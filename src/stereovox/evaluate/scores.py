@@ -116,7 +116,7 @@ class Scores(QuickScores):
 def score(
     voxel_map: VoxelMap,
     truth_map: VoxelMap | TruthCells,
-    threshold: float = 0.7,
+    threshold: float | None = None,
     tolerance: int = 1,
     *,
     bins: int = BINS,
@@ -128,12 +128,13 @@ def score(
 
     truth_map: a map whose occupied cells have a surface and whose free cells were in view and have none; or
     `TruthCells`, made once for many maps, which has its own tolerance. threshold: a cell is called occupied if
-    p > threshold (Eq 8.1). tolerance: cells along each axis. bins: of the reliability diagram; thresholds: (M,) of the
-    curve of precision and recall. path: camera positions (P, 3) or one (3,) in metres, world frame, for `distance`;
-    edges: its rings in metres. Raises StereovoxError for maps of different cell sizes, an empty truth, and
-    numbers out of range.
+    p > threshold (Eq 8.1); None: the map's own. tolerance: cells along each axis. bins: of the reliability diagram;
+    thresholds: (M,) of the curve of precision and recall. path: camera positions (P, 3) or one (3,) in metres, world
+    frame, for `distance`; edges: its rings in metres. Raises StereovoxError for maps of different cell sizes, an empty
+    truth, and numbers out of range.
     """
     truth = truth_map if isinstance(truth_map, TruthCells) else TruthCells(truth_map, tolerance)
+    threshold = voxel_map.config.map.decision.occupied_above if threshold is None else threshold
     reading = truth.read(voxel_map)
     seen, actual = reading.observed, truth.occupied
     p, known = reading.probability[seen], actual[seen]

@@ -51,13 +51,13 @@ class ScoreOptions:
     Attributes:
         free: Which cells are free in truth: all others in `view`, or those that `rays` cross; see `lidar_truth`.
         frames: Frames of each recording (`A:B:S`); None: all.
-        threshold: A cell is called occupied above this probability.
+        threshold: A cell is called occupied above this probability; None: the map's own.
         tolerance: Cells within which a surface counts as found.
     """
 
     free: str = "view"
     frames: str | None = None
-    threshold: float = 0.7
+    threshold: float | None = None
     tolerance: int = 1
 
 
@@ -224,7 +224,8 @@ def _scored(
 
 def _checked(options: ScoreOptions) -> ScoreOptions:
     """Return the validated options; raises StereovoxError for bad values, before any work."""
-    level(options.threshold)
+    if options.threshold is not None:
+        level(options.threshold)
     if options.free not in FREE:
         raise StereovoxError(f"free '{options.free}' is not known; say {' or '.join(FREE)}")
     if not 0 <= options.tolerance <= 8:

@@ -21,6 +21,7 @@ from stereovox.files.safe_io import read_bounded, replacing
 from stereovox.formats import _octree
 from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.evidence import Evidence, to_units
 from stereovox.maps.record.history import Imported
 
@@ -101,14 +102,14 @@ def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = 
 def binary_tree(voxel_map: VoxelMap) -> Tree:
     """Return the map as OctoMap's binary tree: each cell free, occupied or unknown; eight equal cells become one.
 
-    Occupied and free cells stay so. The format cannot express tentative cells: with p >= 0.5 (OctoMap's own threshold)
-    they become occupied, below that unknown. So a user of the file meets no free cell that is not free in the map, and
-    misses no obstacle that the map suspects; but a tentative cell may count as occupied there. Raises MapFileError for
-    cells outside [-32768, 32768).
+    Occupied and free cells stay so. The format cannot express tentative cells: if evidence has not made them less
+    likely they become occupied, otherwise unknown. So a user of the file meets no free cell that is not free in the
+    map, and misses no obstacle that the map suspects; but a tentative cell may count as occupied there. Raises
+    MapFileError for cells outside [-32768, 32768).
     """
-    indices, log_odds = voxel_map.cells()
+    indices, evidence = _evidence(voxel_map)
     state = voxel_map.state(voxel_map.centers(indices))
-    occupied = (state == State.OCCUPIED) | ((state == State.TENTATIVE) & (log_odds >= 0))
+    occupied = (state == State.OCCUPIED) | ((state == State.TENTATIVE) & (evidence >= 0))
     known = occupied | (state == State.FREE)
     nodes = build_octree(indices[known], np.where(occupied, 1, -1)[known].astype(np.float32))
     return Tree(len(nodes), nodes.children[nodes.children > 0].astype("<u2").tobytes())
@@ -117,14 +118,22 @@ def binary_tree(voxel_map: VoxelMap) -> Tree:
 def full_tree(voxel_map: VoxelMap) -> Tree:
     """Return the map as OctoMap's full tree: every known cell with its log-odds, branches with their highest.
 
-    Raises MapFileError for cells outside [-32768, 32768).
+    Log-odds are counted from the map's prior, since OctoMap's is one half: it takes all above 0 as occupied. Raises
+    MapFileError for cells outside [-32768, 32768).
     """
-    nodes = build_octree(*voxel_map.cells())
+    nodes = build_octree(*_evidence(voxel_map))
     records = np.zeros(len(nodes), TREE_NODE)
     records["log_odds"] = nodes.values
     for child in range(8):
         records["children"] |= ((nodes.children >> 2 * child & 3 > 0) << child).astype(np.uint8)
     return Tree(len(nodes), records.tobytes())
+
+
+def _evidence(voxel_map: VoxelMap) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return the known cells (N, 3) and their log-odds (N,) from even odds on: without the prior."""
+    indices, log_odds = voxel_map.cells()
+    rules = CellRules(voxel_map.config.map)
+    return indices, log_odds - rules.format.log_odds(np.array(rules.prior))
 
 
 class Tree(NamedTuple):

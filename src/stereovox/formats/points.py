@@ -59,15 +59,15 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
     (M,) uint8 is JSON. Raises MapFileError if the file cannot be written.
     """
     indices, log_odds = voxel_map.cells()
-    limits = voxel_map.config.map
+    prior, decision = voxel_map.config.map.prior, voxel_map.config.map.decision
     with replacing(path) as file:
         np.savez_compressed(
             file,
             indices=indices,
             log_odds=log_odds,
             voxel_size=np.float64(voxel_map.voxel_size),
-            free_below=np.float64(min(limits.free_below, limits.prior)),
-            occupied_above=np.float64(limits.occupied_above),
+            free_below=np.float64(min(decision.free_below, prior)),
+            occupied_above=np.float64(decision.occupied_above),
             settings=np.frombuffer(json.dumps(voxel_map.config.model_dump()).encode(), np.uint8),
         )
 

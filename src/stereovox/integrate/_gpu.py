@@ -31,6 +31,7 @@ nearness, seen_through, farthest_of = (
     on_gpu(_windows.seen_through),
     on_gpu(_windows.farthest_of),
 )
+has_finer, clear_to = on_gpu(_windows.has_finer), on_gpu(_windows.clear_to)
 touched, classify, passed_by, end_of_view = (
     on_gpu(_projective._touched), on_gpu(_projective._classify), on_gpu(_projective._passed),
     on_gpu(_projective._end_of_view),
@@ -93,8 +94,28 @@ def widen(base, windows):
 
 
 @gpu_kernel
-def fill_tiles(windows):
-    """Fill the tiles of 16 pixels of all levels from `windows.first` on."""
+def widen_clear(base, windows, table):
+    """Fill the clear depths of all levels from `windows.first` on, whose window images are filled."""
+    shape, pitch = windows.shape, windows.pitch
+    for level in range(windows.first, COARSEST + 1):
+        rows, columns = shape[level, 0], shape[level, 1]
+        start = place(np.int32(level), ZERO, ZERO, pitch, windows.height)
+        finer = 1 if has_finer(level) else 0
+        coarser = max(level + finer, 1)
+        source = place(np.int32(coarser), ZERO, ZERO, pitch, windows.height)
+        for i in range(cuda.grid(1), rows * columns, cuda.gridsize(1)):
+            v, u = i // columns, i % columns
+            nearest = NO_RETURN
+            for line in range(max((v >> finer) - 1, 0), min((v >> finer) + 1, shape[coarser, 0] - 1) + 1):
+                for column in range(max((u >> finer) - 1, 0), min((u >> finer) + 1, shape[coarser, 1] - 1) + 1):
+                    nearest = min(nearest, nearness(base[source + line * pitch + column]))
+            at = start + v * pitch + u
+            windows.clear[at] = clear_to(table, nearest) if windows.image[at] > ZERO else ZERO
+
+
+@gpu_kernel
+def fill_tiles(windows, edges):
+    """Fill the tiles of 16 pixels of all levels from `windows.first` on; edges: whether there are clear depths."""
     for level in range(windows.first, COARSEST + 1):
         rows, columns = windows.shape[level, 0], windows.shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, windows.pitch, windows.height)
@@ -104,8 +125,9 @@ def fill_tiles(windows):
             nearest, farthest = NO_RETURN, ZERO
             for line in range(v, min(v + 16, rows)):
                 for column in range(u, min(u + 16, columns)):
-                    d = windows.image[start + line * windows.pitch + column]
-                    nearest, farthest = min(nearest, d), max(farthest, d)
+                    at = start + line * windows.pitch + column
+                    least = windows.clear[at] if edges else windows.image[at]
+                    nearest, farthest = min(nearest, least), max(farthest, windows.image[at])
             windows.lows[offset + i], windows.highs[offset + i] = nearest, farthest
 
 
@@ -320,15 +342,17 @@ def evaluate(depth_m, view, table, windows, origin, mixed, hit_of, hits, counts,
     """
     for i in range(cuda.blockIdx.x, min(counts[SEEN_MIXED], mixed.shape[0]), cuda.gridDim.x):
         cx, cy, cz = corner(view, mixed[i, 0], mixed[i, 1], mixed[i, 2])
-        lowest = passed_by(view, table, cz)
+        lowest, at_edge = passed_by(view, table, table.passed, cz), passed_by(view, table, table.edged, cz)
         anything = 0
         for c in range(cuda.threadIdx.x, 512, cuda.blockDim.x):
             z = cz + view.steps[2, c]
             x, y = cx + view.steps[0, c], cy + view.steps[1, c]
-            measured = windows.image[window_place(view, windows, max(NEAR_PLANE, table.blind), x, y, z)]
+            window = window_place(view, windows, max(NEAR_PLANE, table.blind), x, y, z)
+            measured = windows.image[window]
             row = measured_row(view, table, measured)
             at = table_place(table, row, z - measured, table.columns_per_metre[row])
-            value = cleared(table.clear[at // table.clear.shape[1], at % table.clear.shape[1]], lowest, measured)
+            value = cleared(table.clear[at // table.clear.shape[1], at % table.clear.shape[1]], at_edge, measured)
+            value = np.int16(lowest) if table.edges and z < windows.clear[window] else value
             if table.marks:
                 mark = marked(depth_m, view, table, cx, cy, cz, c)
                 value = np.int16(mark) if mark > 0 else value
@@ -351,7 +375,7 @@ def passed(view, table, origin, hit_table, hit_coords, free, counts, coords, ste
         if find(hit_table, hit_coords, x, y, z) < 0:
             n = cuda.atomic.add(counts, FREE_BLOCKS, 1)
             _, _, cz = corner(view, x, y, z)
-            steps[n] = np.int16(passed_by(view, table, cz))
+            steps[n] = np.int16(passed_by(view, table, table.passed, cz))
             coords[n, 0], coords[n, 1], coords[n, 2] = x + origin[0], y + origin[1], z + origin[2]
 
 

@@ -8,7 +8,7 @@ classified by two comparisons, and only a layer with cells near a measurement is
 import numpy as np
 
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
-from stereovox.integrate._windows import COARSEST, build, nearest_tiles, place
+from stereovox.integrate._windows import COARSEST, build, clear_to, nearest_tiles, place
 from stereovox.kernels._jit import cell, kernel
 from stereovox.kernels._math import floor
 from stereovox.maps.cells._cells import find
@@ -38,7 +38,7 @@ def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, m
     nothing. windows, scratch, nearest: `Windows`, `WindowScratch` and tiles, written. stack: (STACK, 4) int32 scratch.
     free, mixed: (capacity, 3) int32, written: block coordinates from the camera's block.
     """
-    farthest = build(ends.reshape(ends.size), windows, scratch)
+    farthest = build(ends.reshape(ends.size), windows, table, scratch)
     if table.marks:
         nearest_tiles(depth_m, nearest[0], nearest[1])
         farthest = view.max_range  # a lone pixel, which clears nothing, marks cells next to its point
@@ -126,7 +126,7 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
     for i in range(blocks.shape[0]):
         cx, cy, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), scratch, out)
+        _clear(view, table, windows, cx, cy, cz, scratch, out)
         if table.marks:
             for c in range(512):
                 mark = marked(depth_m, view, table, cx, cy, cz, c)
@@ -142,7 +142,7 @@ def _pass(view, table, blocks, out):
     """Write the evidence (n,) on all cells of each of `blocks` (n, 3), which are wholly free."""
     for i in range(blocks.shape[0]):
         _, _, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
-        out[i] = np.int16(_passed(view, table, cz))
+        out[i] = np.int16(_passed(view, table, table.passed, cz))
 
 
 @cell
@@ -246,9 +246,11 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     closest = NO_RETURN
     for level in range(finest, coarsest + 1):
         closest = min(closest, _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False))
+    if not table.edges:
+        closest = clear_to(table, closest)
     if table.marks:
-        closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
-    return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED
+        closest = min(closest, clear_to(table, _nearest(nearest, tile, u0, u1, v0, v1)))
+    return FREE if z_high < closest * (ONE - SLACK) else MIXED
 
 
 @cell
@@ -282,17 +284,6 @@ def _pixel(x, last):
 
 
 @cell
-def _clear_to(table, depth):
-    """Return the z up to which every measurement of at least `depth` gives plain free space."""
-    if depth <= ZERO:
-        return ZERO
-    if depth >= NO_RETURN:
-        return NO_RETURN
-    row = table_row(depth, table.rows_per_metre, table.hit.size)
-    return min(depth - table.reach[row], table.safe[row + 1])
-
-
-@cell
 def _extreme(windows, image, level, tile, u0, u1, v0, v1, highest):
     """Return the highest (or lowest) window value over the tiles that pixels u0..u1, v0..v1 touch."""
     shift = max(level - 1, 0) + (4 if tile == 0 else 6)
@@ -318,34 +309,39 @@ def _nearest(nearest, tile, u0, u1, v0, v1):
 
 
 @cell
-def _passed(view, table, cz):
+def _passed(view, table, passed, cz):
     """Return the largest loss of the cells of a block that are seen through, by the depth of its centre.
 
-    cz: depth of the block's corner.
+    passed: (rows,) of the table, of plain cells or of those next to an edge. cz: depth of the block's corner.
     """
     R = view.rotation
     z = cz + np.float32(4) * view.voxel_size * (R[2, 0] + R[2, 1] + R[2, 2])
-    return table.passed[table_row(min(max(z, ZERO), view.max_range), table.rows_per_metre, table.passed.size)]
+    return passed[table_row(min(max(z, ZERO), view.max_range), table.rows_per_metre, passed.size)]
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
-    """Write the negative evidence of how far one sees through a window of about the cell's size, never below `lowest`.
+def _clear(view, table, windows, cx, cy, cz, scratch, out):
+    """Write the negative evidence of how far one sees through a window of about the cell's size.
 
     scratch: see `evaluate`.
     """
-    depths, measured, _, at, _ = scratch
+    depths, measured, clear, at, _ = scratch
     R = view.rotation
     farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
     z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
     before = table.before[table_row(min(z_most, view.max_range), table.rows_per_metre, table.before.size)]
+    lowest, at_edge = _passed(view, table, table.passed, cz), _passed(view, table, table.edged, cz)
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _aim(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, at)
         _load(windows.image, at, measured)
-        if _write_free_layer(depths, measured, before, table.behind, lowest, out[cells]):
-            _look_up(view, table, scratch, lowest, out[cells])
+        if table.edges:
+            _load(windows.clear, at, clear)
+        else:
+            clear[:] = UNSEEN
+        if _write_free_layer(depths, measured, clear, before, table.behind, lowest, at_edge, out[cells]):
+            _look_up(view, table, scratch, at_edge, out[cells])
 
 
 # Computing indices, loading from them and computing with the loaded values are separate loops, here and below: most
@@ -393,19 +389,23 @@ def _load(values, at, out):
 
 
 @cell
-def _write_free_layer(depths, measured, before, behind, lowest, out):
-    """Write `lowest` for cells wholly before their measurement, else 0; return whether any is near it."""
+def _write_free_layer(depths, measured, clear, before, behind, lowest, at_edge, out):
+    """Write the loss of cells wholly before their measurement, else 0; return whether any is near its measurement."""
     near = np.int32(0)
     for c in range(LAYER):
         ahead = measured[c] - depths[c]
-        out[c] = np.int16(lowest if ahead > before else np.int32(0))
-        near |= np.int32((ahead <= before) & (ahead >= -behind) & (measured[c] > ZERO))
+        is_clear = depths[c] < clear[c]
+        out[c] = np.int16(lowest if is_clear else (at_edge if ahead > before else np.int32(0)))
+        near |= np.int32((ahead <= before) & (ahead >= -behind) & (measured[c] > ZERO) & ~is_clear)
     return near != 0
 
 
 @cell
-def _look_up(view, table, scratch, lowest, out):
-    """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
+def _look_up(view, table, scratch, at_edge, out):
+    """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `at_edge`.
+
+    out: of the others, unchanged.
+    """
     depths, measured, scale, at, row = scratch
     for c in range(LAYER):
         row[c] = measured_row(view, table, measured[c])
@@ -414,7 +414,7 @@ def _look_up(view, table, scratch, lowest, out):
         at[c] = table_place(table, row[c], depths[c] - measured[c], scale[c])
     _load(table.clear.reshape(table.clear.size), at, row)
     for c in range(LAYER):
-        out[c] = cleared(row[c], lowest, measured[c])
+        out[c] = min(out[c], cleared(row[c], at_edge, measured[c]))
 
 
 @cell

@@ -74,7 +74,7 @@ class GpuEye:
         view = self._view.at(self._views.at(image.T_world_sensor))
         origin = tuple(self._views.block)
         flat = self._depth_m.reshape(self._depth_m.size)
-        self._windows.build(flat)
+        self._windows.build(flat, self._table)
         while True:
             self._list_blocks(flat, view)
             self._evaluate(view, origin)
@@ -164,12 +164,14 @@ class GpuWindows:
         self._base = gpu_array(windows.image.size, np.float32)
         self._levels, self._size, self._marks = range(1, len(windows.shape)), windows.shape[0].tolist(), marks
 
-    def build(self, depth_m: Any) -> None:
-        """Fill the images from a flat REP 117 depth image on the card."""
+    def build(self, depth_m: Any, table: Any) -> None:
+        """Fill the images from a flat REP 117 depth image on the card; table: its `KernelTable` there."""
         for level in self._levels:
             launch(_gpu.shrink, depth_m, self._base, self.on_gpu, level)
         launch(_gpu.widen, self._base, self.on_gpu)
-        launch(_gpu.fill_tiles, self.on_gpu)
+        if table.edges:
+            launch(_gpu.widen_clear, self._base, self.on_gpu, table)
+        launch(_gpu.fill_tiles, self.on_gpu, table.edges)
         launch(_gpu.join_tiles, self.on_gpu)
         if self._marks:
             for size, tiles in zip((16, 64), self.nearest, strict=True):

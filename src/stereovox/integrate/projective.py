@@ -98,7 +98,7 @@ class LayerScratch(NamedTuple):
 
     depths: NDArray[np.float32]  # of the cells' centres
     measured: NDArray[np.float32]  # window values there
-    scale: NDArray[np.float32]  # table columns per metre
+    scale: NDArray[np.float32]  # clear depths there, then table columns per metre
     at: NDArray[np.int32]  # indices of window values, then of entries of the sensor table
     row: NDArray[np.int32]  # rows of the sensor table, then its entries
 
@@ -240,11 +240,12 @@ class Windows(NamedTuple):
     """All window images in one; see `_windows.py`."""
 
     image: NDArray[np.float32]  # flat; `_windows.place` gives the index of a pixel; the last entry is UNSEEN
+    clear: NDArray[np.float32]  # likewise: the depth up to which an area about twice as wide is plainly free
     pitch: np.int32
     height: np.int32
     shape: NDArray[np.int32]  # (levels, 2) rows and columns
-    lows: NDArray[np.float32]  # nearest values of tiles
-    highs: NDArray[np.float32]  # farthest
+    lows: NDArray[np.float32]  # least values of tiles of `clear`
+    highs: NDArray[np.float32]  # farthest values of tiles of `image`
     tile_offset: NDArray[np.int32]  # (levels, 2) start of tiles of 16 and of 64
     tile_width: NDArray[np.int32]  # (levels, 2) tiles in a row
     first: np.int32  # lowest level that is filled
@@ -253,8 +254,7 @@ class Windows(NamedTuple):
 class WindowScratch(NamedTuple):
     """Memory of `_windows.build`."""
 
-    base: NDArray[np.float32]  # like `Windows.image`: the images before dilation
-    ring: NDArray[np.float32]  # (4, pitch)
+    base: NDArray[np.float32]  # like `Windows.image`: how far one sees through single tiles
     row: NDArray[np.float32]  # (pitch,), like the rest
     other: NDArray[np.float32]
     high_row: NDArray[np.float32]
@@ -275,16 +275,15 @@ def make_windows(camera: PinholeCamera, smallest_tile: float) -> tuple[Windows, 
     first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
     pitch = coarsest * -(-w // coarsest)
     size = pitch * (2 * h + -(-h // 2))
-    image = np.zeros(size + 1, np.float32)
-    image[size] = _projective.UNSEEN
+    image, clear = np.zeros((2, size + 1), np.float32)
+    image[size] = clear[size] = _projective.UNSEEN
     lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
     windows = Windows(
-        image, np.int32(pitch), np.int32(h), shape, lows, highs,
+        image, clear, np.int32(pitch), np.int32(h), shape, lows, highs,
         _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2), np.ascontiguousarray(tiles[:, :, 1], np.int32),
         np.int32(first),
     )  # fmt: skip
-    rows = np.zeros((8, pitch), np.float32)
-    scratch = WindowScratch._make([np.zeros(size, np.float32), rows[:4], *rows[4:]])
+    scratch = WindowScratch(np.zeros(size, np.float32), *np.zeros((4, pitch), np.float32))
     near16, near64 = (np.zeros((-(-h // tile), -(-w // tile)), np.float32) for tile in (16, 64))
     return windows, scratch, (near16, near64)
 

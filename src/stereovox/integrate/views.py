@@ -86,6 +86,7 @@ class KernelTable(NamedTuple):
     mark: NDArray[np.int32]  # (rows, columns) positive evidence next to the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
     passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is seen through; negative
+    edged: NDArray[np.int32]  # (rows,) the same next to an edge
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns per metre
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
     safe: NDArray[np.float32]  # (rows + 1,) nearest z that is not plainly free for some later row
@@ -95,6 +96,7 @@ class KernelTable(NamedTuple):
     blind: np.float32  # depth in metres up to which nothing is cleared
     free: np.int32  # evidence far before a measurement, if `passed` allows it
     marks: bool  # whether there is any positive evidence next to the hit
+    edges: bool  # whether cells next to an edge lose less than others
 
 
 class Rays(NamedTuple):
@@ -140,14 +142,18 @@ def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCame
         sensor, blind = Arc(camera.solid_angle), max(blind, camera.range_min)
     noise = RangeNoise.of(config.noise, camera)
     table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
-    return kernel_table(table, config.max_range, blind)
+    return kernel_table(table, config.max_range, blind, config.projective.edge_share)
 
 
-def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> KernelTable:
-    """Return `table` in the form that kernels read; up to depth `blind` in metres nothing is cleared."""
+def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0, edge_share: float = 1.0) -> KernelTable:
+    """Return `table` in the form that kernels read; up to depth `blind` in metres nothing is cleared.
+
+    edge_share: see `ProjectiveConfig`.
+    """
     units = to_units(table.log_odds)
     clear, mark = np.minimum(units, 0), np.maximum(units, 0)
     free = int(units[0, 0])
+    passed = np.maximum(to_units(table.passed), free)
     reach = REACH_SIGMA * table.sigma
     edges = np.arange(len(reach)) / table.rows_per_metre
     safe = np.append(np.minimum.accumulate((edges - reach)[::-1])[::-1], max_range)
@@ -155,7 +161,8 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> Ke
         clear,
         mark,
         to_units(table.hit),
-        np.maximum(to_units(table.passed), free),
+        passed,
+        np.floor(edge_share * passed).astype(np.int32),
         (COLUMNS / (2 * reach)).astype(np.float32),
         reach.astype(np.float32),
         safe.astype(np.float32),
@@ -165,6 +172,7 @@ def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> Ke
         np.float32(blind),
         np.int32(free),
         bool((mark > 0).any()),
+        edge_share < 1,
     )
 
 

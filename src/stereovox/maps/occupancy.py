@@ -57,6 +57,14 @@ class OccupancyGrid:
         return states[self.cells.view(np.uint8)]
 
     @property
+    def message_cells(self) -> NDArray[np.int8]:
+        """`cells` for `nav_msgs/OccupancyGrid`, which has no thresholds: free is below 30, occupied above 70."""
+        free, occupied = 100 * self.free_below, 100 * self.occupied_above
+        ends = [0, np.ceil(free) - 1, np.ceil(free), np.floor(occupied), np.floor(occupied) + 1, 100]
+        spread = np.interp(np.arange(256, dtype=np.uint8).view(np.int8), ends, [0, 29, 30, 70, 71, 100], left=UNKNOWN)
+        return np.rint(spread).astype(np.int8)[self.cells.view(np.uint8)]
+
+    @property
     def known_span(self) -> tuple[slice, slice]:
         """The range of rows and columns with known cells; both empty if there are none."""
         known = self.cells != UNKNOWN
@@ -131,14 +139,16 @@ class Percent:
 
     @cached_property
     def free_below(self) -> float:
-        """Probability below which cells are free: none that evidence made likelier than the prior is."""
-        just_above = (self._rules.prior + 0.5 - self._format.unknown) / self._format.per_log_odds
-        return min(self._rules.config.free_below, float(1 / (1 + np.exp(-just_above))))
+        """Probability below which cells are free."""
+        return self._probability(self._rules.free_below)
 
-    @property
+    @cached_property
     def occupied_above(self) -> float:
         """Probability above which cells are occupied."""
-        return self._rules.config.occupied_above
+        return self._probability(self._rules.occupied_above)
+
+    def _probability(self, stored: float) -> float:
+        return round(float(1 / (1 + np.exp(-(stored - self._format.unknown) / self._format.per_log_odds))), 6)
 
     @cached_property
     def shown(self) -> NDArray[np.int8]:

@@ -41,6 +41,8 @@ MAX_CELLS = 20_000_000
 """Most cells inspected for one message."""
 LEVEL_ERROR = 0.02
 """Length by which the map's `up` may miss its true direction (1.1 degrees)."""
+HAIR = 1e-3
+"""Error of a probability by the steps in which log-odds are stored."""
 STEEPEST = 0.1
 """Least horizontal length of the forward axis, a unit vector: 84 degrees of pitch."""
 UnknownAs = Literal["obstacle", "unmeasured"]
@@ -94,7 +96,8 @@ class Sectors(NamedTuple):
     Attributes:
         obstacle_m: (72,) float64 horizontal metres from the body's origin to the nearest cell that is occupied, or
             tentative beyond `own_radius`; infinite: none up to `max_distance`.
-        unknown_m: (72,) float64 the same for unknown cells beyond `own_radius`.
+        unknown_m: (72,) float64 the same for cells beyond `own_radius` that are unknown, or tentative although evidence
+            has made them no likelier: space that is not free yet.
     """
 
     obstacle_m: NDArray[np.float64]
@@ -246,13 +249,19 @@ def check_number_of_cells(low: NDArray[np.int64], high: NDArray[np.int64]) -> No
 def _states(
     voxel_map: VoxelMap, cell: NDArray[np.float64], low: NDArray[np.int64], high: NDArray[np.int64], oldest_s: float
 ) -> NDArray[np.uint8]:
-    """Return the states (i, j, k) of a box of cells."""
+    """Return the states (i, j, k) of a box of cells; tentative cells no likelier than the prior are unknown."""
     shape = tuple(high - low + 1)
     centres = np.empty((*shape, 3))
     for axis in range(3):
         line = (low[axis] + np.arange(shape[axis]) + 0.5) * cell[axis]
         centres[..., axis] = line.reshape([-1 if other == axis else 1 for other in range(3)])
-    return states_of(voxel_map, centres.reshape(-1, 3), oldest_s).reshape(shape)
+    points = centres.reshape(-1, 3)
+    with voxel_map.lock:
+        states = states_of(voxel_map, points, oldest_s)
+        tentative = np.flatnonzero(states == State.TENTATIVE)
+        prior = voxel_map.config.map.prior
+        states[tentative[voxel_map.probability(points[tentative]) <= prior + HAIR]] = State.UNKNOWN
+    return states.reshape(shape)
 
 
 def states_of(voxel_map: VoxelMap, points: NDArray[np.float64], oldest_s: float) -> NDArray[np.uint8]:

@@ -60,7 +60,7 @@ def occupancy_message(grid: OccupancyGrid, stamp_ns: int, frame_id: str) -> Any:
     x, y, yaw = grid.origin
     message.info.origin.position.x, message.info.origin.position.y = float(x), float(y)
     message.info.origin.orientation.z, message.info.origin.orientation.w = np.sin(yaw / 2), np.cos(yaw / 2)
-    message.data = array("b", np.ascontiguousarray(grid.cells, np.int8).tobytes())
+    message.data = array("b", np.ascontiguousarray(grid.message_cells).tobytes())
     return message
 
 

@@ -23,8 +23,7 @@ class Stereo:
     8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
-    its noise leaves it in this cell, but at least with `p_least`. This becomes evidence relative to `prior`, and only
-    the share `trust` of it counts, since the errors of one frame recur in the next.
+    its noise leaves it in this cell, but at least with `p_least`. This becomes evidence relative to `prior`.
 
     A cell that a ray passes through loses at most the share `passes` of what a hit at its depth would give: most frames
     see only what is behind a pole thinner than a pixel, and must not outvote the frames that do see it.
@@ -32,12 +31,11 @@ class Stereo:
 
     p_right: float = 0.95
     prior: float = 0.1
-    trust: float = 0.8
-    p_free: float = 0.3716
+    p_free: float = 0.3
     p_unknown: float = 0.5
-    p_least: float = 0.7
+    p_least: float = 0.8
     fade: float = 2.0
-    passes: float = 0.3
+    passes: float = 0.5
 
     def __post_init__(self) -> None:
         if not self.fade < END_SIGMA:
@@ -54,8 +52,8 @@ class Stereo:
     def hit(self, z_measured: Array, sigma: Array, voxel_size: float) -> Array:
         """Return the probability of the cell that holds the measured point, at even prior odds; at least p_least."""
         p = self.p_right * stays(np.asarray(sigma) / voxel_size)
-        evidence = self.trust * (np.log(p / (1 - p)) - np.log(self.prior / (1 - self.prior)))
-        return np.maximum(1 / (1 + np.exp(-evidence)), self.p_least)
+        odds = p / (1 - p) * (1 - self.prior) / self.prior
+        return np.maximum(odds / (1 + odds), self.p_least)
 
     def passed(self, z: Array, sigma: Array, voxel_size: float) -> Array:
         """Return the lowest probability of a cell at depth `z` that a ray passes through, at even prior odds."""

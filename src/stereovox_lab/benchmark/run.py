@@ -74,7 +74,7 @@ def judged(library: Library, task: Task, tell: Progress = silent) -> dict[str, A
             refused += 1
     made = contestant.map()
     bare = VoxelMap.from_cells(made.config, *made.cells())
-    scores = score(bare, task.truth, made.config.map.occupied_above)
+    scores = score(bare, task.truth)
     times = contestant.ms[1:] or contestant.ms  # the first may include compilation
     return {
         "library": library.name,

@@ -4,17 +4,21 @@
 import numpy as np
 import pytest
 
+import stereovox as sv
 from stereovox.config import load_config
 from stereovox.maps import State, VoxelMap, load_map, make_map
-from stereovox.maps.cells.cell_format import FORMATS
+from stereovox.maps.cells.cell_format import FORMATS, CellRules
 from stereovox.maps.cells.evidence import Evidence
 
+WIDE = {"map.log_odds_min": -9.0, "map.log_odds_max": 9.0}
+THESIS = {"map.free_below": 0.3, "map.occupied_above": 0.7}
 CENTRES = np.array([[0.05, 0.05, 0.05 + 0.1 * k] for k in range(8)])
 
 
 def byte_map(prior=0.5):
     return VoxelMap(load_config("default", voxel_size=0.1, **{
-        "map.cell": "uint8", "map.log_odds_min": -2.1, "map.log_odds_max": 2.1, "map.prior": prior}))  # fmt: skip
+        "map.cell": "uint8", "map.log_odds_min": -2.1, "map.log_odds_max": 2.1,
+        **THESIS, "map.prior": prior}))  # fmt: skip
 
 
 def add(voxel_map, *first_cells):
@@ -115,7 +119,7 @@ def test_what_evidence_made_likelier_is_never_free(cell, prior):
 
 
 def signed_map(**limits):
-    return VoxelMap(load_config(voxel_size=0.1, **{"map.cell": "int8", "map.prior": 0.5}, **limits))
+    return VoxelMap(load_config(voxel_size=0.1, **{"map.cell": "int8", **THESIS, "map.prior": 0.5}, **limits))
 
 
 def test_the_signed_byte_holds_the_default_limits():
@@ -177,3 +181,34 @@ def test_chiens_byte_rounds_to_the_nearest_in_every_frame():
     for one.frames in (0, 1, 17):
         add(one, 7, -7, 9)
     assert stored(one)[:3] == [127, 127, 130]
+
+
+@pytest.mark.parametrize(("missed_obstacle", "false_alarm"), [(18.0, 1.4), (3.0, 3.0), (50.0, 1.05), (2.5, 20.0)])
+def test_a_cell_gets_the_state_of_least_expected_cost(missed_obstacle, false_alarm):
+    """All three costs are written down for every storable number, and the smallest wins."""
+    rules = CellRules(sv.load_config(**{"map.missed_obstacle": missed_obstacle, "map.false_alarm": false_alarm}).map)
+    stored = np.arange(rules.lowest, rules.highest + 1)
+    stored = stored[stored != rules.format.unknown]
+    p = 1 / (1 + np.exp(-stored / 1000))
+    costs = np.stack([p * missed_obstacle, np.ones(len(p)), (1 - p) * false_alarm])
+    expected = np.array([State.FREE, State.TENTATIVE, State.OCCUPIED])[np.argmin(costs, axis=0)]
+    expected[(stored > rules.prior) & (expected == State.FREE)] = State.TENTATIVE
+    assert len(set(expected.tolist())) == 3
+    np.testing.assert_array_equal(rules.states(stored), expected)
+
+
+def test_thresholds_of_ones_own_come_before_costs():
+    config = sv.load_config(**{"map.free_below": 0.2, "map.missed_obstacle": 50}).map
+    assert config.decision == (0.2, pytest.approx(1 - 1 / config.false_alarm))
+
+
+@pytest.mark.parametrize("prior", [0.03, 0.3, 0.5, 0.7])
+def test_with_another_prior_the_same_evidence_decides(prior):
+    evidence = np.linspace(-4, 4, 801)
+    at = [np.log(p / (1 - p)) for p in (0.1, prior)]
+    usual, other = (CellRules(sv.load_config(**{"map.prior": p} | WIDE).map) for p in (0.1, prior))
+    expected, found = (
+        rules.states(np.rint(1000 * (evidence + start)).astype(int))
+        for rules, start in zip((usual, other), at, strict=True)
+    )
+    assert np.count_nonzero(expected != found) <= 2  # at a threshold, by rounding

@@ -113,7 +113,7 @@ def test_cells_are_forgotten_in_time_and_no_others(more):
 
 def test_what_is_forgotten_starts_from_the_prior_and_is_never_free():
     one = VoxelMap(settings(**{"map.forget_s": 1.0}))
-    made.fly(one, [(made.at((0, 0, 0), 0), one_cell(9000)), (made.at((0, 0, 0), SECOND), one_cell(-100, cell=5))])
+    made.fly(one, [(made.at((0, 0, 0), 0), one_cell(9000)), (made.at((0, 0, 0), SECOND), one_cell(-1000, cell=5))])
     place = [[0.05, 0.05, 0.05]]
     for tenths in range(11, 30):
         made.fly(one, [(made.at((0, 0, 0), tenths * SECOND // 10), one_cell(-1, cell=5))])
@@ -136,9 +136,9 @@ def test_a_clock_that_was_reset_makes_cells_of_the_other_time_unknown():
 def test_free_blocks_without_numbers_are_forgotten_too():
     one = VoxelMap(settings(**{"map.forget_s": 1.0}))
     free = Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.zeros((1, 3), np.int32), -30000)
-    made.fly(one, [(made.at((0, 0, 0), 0), free), (made.at((0, 0, 0), SECOND // 2), one_cell(-1))])
+    made.fly(one, [(made.at((0, 0, 0), 0), free), (made.at((0, 0, 0), SECOND // 2), one_cell(-1000))])
     assert one.counts()["free"] == 512
-    made.fly(one, [(made.at((0, 0, 0), SECOND * 13 // 10), one_cell(-1, cell=1))])
+    made.fly(one, [(made.at((0, 0, 0), SECOND * 13 // 10), one_cell(-1000, cell=1))])
     assert one.counts()["free"] == 2
     made.fly(one, [(made.at((0, 0, 0), 9 * SECOND), one_cell(0))])
     assert one.memory_bytes == VoxelMap(settings()).memory_bytes, "neither cells nor times are kept"

@@ -37,7 +37,7 @@ def random_map(seed, **settings):
         shares = ([1, 0, 0, 0], [0, 1, 0, 0], [0.005, 0.98, 0.01, 0.005], [0.3, 0.3, 0.2, 0.2])[kind]
         states[x : x + 8, y : y + 8, z : z + 8] = rng.choice(4, (8, 8, 8), p=shares)
     known = np.argwhere(states)
-    log_odds = np.array([0.0, -3.0, 0.3, 2.0])[states[tuple(known.T)]]
+    log_odds = np.array([0.0, -3.0, -1.5, 2.0])[states[tuple(known.T)]]
     voxel_map = VoxelMap.from_cells(config, known - HALF, log_odds)
     none = np.empty((0, 3), np.int32), np.empty((0, 512), np.int16)
     voxel_map.add(Evidence(*none, blocks[kinds == 1].astype(np.int32), -9000))  # to the floor
@@ -382,7 +382,7 @@ def test_what_is_larger_than_the_map_is_answered(world):
 
 def test_a_box_of_tentative_cells_among_the_unknown():
     """One tentative block far from the box's corner is found by way of the list of blocks."""
-    voxel_map = VoxelMap.from_cells(load_config(voxel_size=0.1), [[9000, 9000, 9000]], [0.2])
+    voxel_map = VoxelMap.from_cells(load_config(voxel_size=0.1), [[9000, 9000, 9000]], [-1.5])
     assert voxel_map.check_boxes([[-1e4] * 3], [[1e4] * 3]).tolist() == [TENTATIVE]
     assert voxel_map.check_capsules([[-1e4] * 3], [[1e4] * 3], 0.01).tolist() == [TENTATIVE]
 

@@ -37,6 +37,7 @@ def slow(voxel_map, evidence):
     stored = {tuple(c): cells for c, cells in zip(*voxel_map.storage.blocks(), strict=True)}
     rules = voxel_map.storage.rules
     free_most, occupied_least = map(int, rules.thresholds)
+    likely = max(occupied_least, int(rules.format.stored(np.log(0.7 / 0.3))))
     spoken = [*zip(evidence.coords, evidence.values, strict=True)]
     spoken += [(c, np.full(512, step)) for c, step in zip(evidence.uniform, evidence.uniform_values, strict=True)]
     for coords, values in spoken:
@@ -51,7 +52,7 @@ def slow(voxel_map, evidence):
                 continue
             if states[x, y, z] == State.OCCUPIED and value > 0:
                 out["hits"] += value
-            if number >= (occupied_least + int(rules.highest)) / 2 and value < 0:
+            if number >= (likely + int(rules.highest)) / 2 and value < 0:
                 out["passes"] -= value
             if number <= (free_most + int(rules.lowest)) // 2 and value >= FIRM:
                 out["into_free"] += value

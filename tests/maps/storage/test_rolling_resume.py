@@ -103,7 +103,7 @@ def test_cells_in_tiles_are_found_like_all_others():
         np.testing.assert_array_equal(rolling.state(points), whole.state(points))
         assert (rolling.state(rolling.occupied()) == State.OCCUPIED).all()
         assert (rolling.state(rolling.free()) == State.FREE).all()
-        assert len(rolling.occupied()) == 2
+        assert len(rolling.occupied()) == 3
     assert rolling.log_odds(np.zeros((0, 3))).shape == (0,)
     rolling.close()
 

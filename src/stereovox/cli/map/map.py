@@ -188,5 +188,6 @@ def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:
         return "no cell is known; the camera was never in the box of window.centre and window.size"
     if result["tentative"]:
         tentative = thousands(result["tentative"])
-        return f"no cell is occupied, but {tentative} are tentative; is --max-range large enough, map.prior too low?"
+        causes = "is --max-range large enough, map.false_alarm too large?"
+        return f"no cell is occupied, but {tentative} are tentative; {causes}"
     return "no cell is occupied; is --max-range large enough?"

@@ -73,7 +73,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("truth", metavar="TRUTH", help=about)
     parser.add_argument("--report", metavar="DIR", help="folder for a page with charts")
     maps = parser.add_argument_group("maps")
-    about = "a cell is called occupied above it (default: 0.7; for a floor map the threshold in its file)"
+    about = "a cell is called occupied above it (default: the map's own)"
     maps.add_argument("--threshold", type=float, metavar="P", help=about)
     about = f"distance that still counts as a match (default: {TOLERANCE})"
     maps.add_argument("--tolerance", type=int, metavar="CELLS", help=about)
@@ -202,12 +202,12 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
 
     refuse_options(arguments, ("exclude",), "only for floor maps (.yaml)")
     refuse_options(arguments, ("no_align",), "only for floor maps (.yaml) and trajectories")
-    threshold = 0.7 if arguments.threshold is None else arguments.threshold
-    level(threshold)  # raises for a bad threshold before large maps are read
+    if arguments.threshold is not None:
+        level(arguments.threshold)  # raises for a bad threshold before large maps are read
     path = None if arguments.path is None else read_camera_path(arguments.path)
     truth = TruthCells(read_map(arguments.truth), _tolerance(arguments))
     voxel_map = read_map(arguments.map)
-    scores = score(voxel_map, truth, threshold, path=path)
+    scores = score(voxel_map, truth, arguments.threshold, path=path)
     result = scores.as_dict()
     if scores.distance is not None:
         result["distance"] = scores.distance.rows()
@@ -218,7 +218,7 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
     if arguments.report:
         from stereovox.view.report.evaluation import Evaluated, write_evaluation_report
 
-        shown = outcomes(truth.read(voxel_map), truth, threshold)
+        shown = outcomes(truth.read(voxel_map), truth, scores.threshold)
         evaluated = Evaluated(Path(arguments.map).name, scores, outcomes=shown)
         page = write_evaluation_report(arguments.report, [evaluated], Path(arguments.truth).name)
         say(f"report: {page}")

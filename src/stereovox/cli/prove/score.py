@@ -41,7 +41,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "crosses (rays)",
     )
     parser.add_argument(
-        "--threshold", type=float, default=0.7, metavar="P", help="a cell is called occupied above (0.7)"
+        "--threshold", type=float, metavar="P", help="a cell is called occupied above it (default: the map's own)"
     )
     parser.add_argument("--tolerance", type=int, default=1, metavar="CELLS", help="distance that counts as a match (1)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one per core)")

@@ -18,6 +18,8 @@ from stereovox.maps.cells import _cells
 
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken as a probability of 0.7."""
+SURELY = 0.3
+"""Upper bound on the probability of a free cell at its lower limit, whatever the costs."""
 LIKELY = 0.7
 """Lower bound on the probability that counts as certainly occupied, however low the threshold."""
 
@@ -27,9 +29,9 @@ class State(IntEnum):
 
     Attributes:
         UNKNOWN: No evidence.
-        FREE: p < `map.free_below`.
+        FREE: p < 1 / `map.missed_obstacle`, or `map.free_below`.
         TENTATIVE: Between both thresholds.
-        OCCUPIED: p > `map.occupied_above`.
+        OCCUPIED: p > 1 - 1 / `map.false_alarm`, or `map.occupied_above`.
     """
 
     UNKNOWN = _cells.UNKNOWN
@@ -108,13 +110,19 @@ class CellRules:
 
     @cached_property
     def free_below(self) -> float:
-        """Stored numbers below this are free: unlikely, and no likelier than before the first evidence."""
-        return min(self._exact(self.config.free_below), float(self.prior) + 0.5)
+        """Stored numbers below this are free: unlikely, and no likelier than before the first evidence.
+
+        By costs, a cell at its lower limit is as free as it can be, if that is below `SURELY`.
+        """
+        unlikely = self._exact(self.config.decision.free_below)
+        if self.config.free_below is None:
+            unlikely = max(unlikely, min(float(self.lowest) + 0.5, self._exact(SURELY)))
+        return min(unlikely, float(self.prior) + 0.5)
 
     @cached_property
     def occupied_above(self) -> float:
         """Stored numbers above this are occupied."""
-        return self._exact(self.config.occupied_above)
+        return self._exact(self.config.decision.occupied_above)
 
     @cached_property
     def most_rise(self) -> int | None:
@@ -131,7 +139,7 @@ class CellRules:
         if most < 1:
             raise ConfigError(
                 f"map.confirm_hits {frames}: cells of {self.config.cell} count at most {max(1, way - 1)} hits from "
-                "map.prior to map.occupied_above; ask for fewer"
+                "map.prior to occupied; ask for fewer"
             )
         return most
 

@@ -151,7 +151,7 @@ class Messages:
             height=rows,
             origin=self._pose(lifted(grid.origin)),
         )
-        data = np.ascontiguousarray(grid.cells, np.int8).ravel()
+        data = np.ascontiguousarray(grid.message_cells).ravel()
         return self._make("nav_msgs/msg/OccupancyGrid", header=self._header(stamp_ns, frame_id), info=info, data=data)
 
     def octomap(self, data: bytes, binary: bool, resolution: float, stamp_ns: int, frame_id: str) -> Any:

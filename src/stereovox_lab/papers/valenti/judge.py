@@ -29,6 +29,9 @@ BOX = "box"
 Halves = Mapping[str, tuple[TruthCells, TruthCells]]
 """By the kind of truth: its parts at the first and second half of a path."""
 
+CALLED = 0.7
+"""A cell is called occupied above this probability (8.3)."""
+
 
 @dataclass
 class ScoreSeries:
@@ -38,7 +41,7 @@ class ScoreSeries:
     """
 
     truth: TruthCells
-    threshold: float = 0.7
+    threshold: float = CALLED
     frames: list[int] = field(default_factory=list)
     scores: list[QuickScores] = field(default_factory=list)
 
@@ -186,11 +189,14 @@ def _judged(
     series: ScoreSeries | None,
 ) -> Judged:
     voxel_map = contestant.map()
-    scores = {kind: score(voxel_map, truth, thresholds=THRESHOLDS) for kind, truth in truths.items()}
+    scores = {kind: score(voxel_map, truth, CALLED, thresholds=THRESHOLDS) for kind, truth in truths.items()}
     both = None
     if parts is not None:
         both = {
-            kind: (score(voxel_map, first, thresholds=THRESHOLDS), score(voxel_map, second, thresholds=THRESHOLDS))
+            kind: (
+                score(voxel_map, first, CALLED, thresholds=THRESHOLDS),
+                score(voxel_map, second, CALLED, thresholds=THRESHOLDS),
+            )
             for kind, (first, second) in parts.items()
         }
     arrays, shown = None, None

@@ -62,7 +62,7 @@ def test_cells_are_those_of_the_slow_twin(seed, beam_deg, distance):
     before, arc, outside = naive_integrators.cone(distance, T, beam.beam, beam.sigma, config)
     assert len(before) > 5
     assert len(arc) > 10
-    assert {ours.get(cell) for cell in before} == {round(1000 * np.log(0.4 / 0.6))}
+    assert {ours.get(cell) for cell in before} == {round(1000 * np.log(0.34 / 0.66))}
     assert not any(cell in ours for cell in outside)
     (value,) = {ours.get(cell) for cell in arc}
     (share,) = set(arc.values())

@@ -359,7 +359,7 @@ def cone(distance: float, T: NDArray, beam: float, sigma: float, config: Config)
         on_it = (np.abs(away - distance) < size.min() / 20) & (angle < half - gap)
         key = tuple(cell.tolist())
         if (angle < half - gap).all() and away.max() < distance - reach - size.max() and away.min() > config.blind:
-            before[key] = np.log(0.34 / 0.66)
+            before[key] = np.log(0.345 / 0.655)
         elif on_it.sum() >= 30:
             arc[key] = share
         elif (angle > half).all() or away.min() > distance:

@@ -61,7 +61,9 @@ class OccupancyGrid:
         """`cells` for `nav_msgs/OccupancyGrid`, which has no thresholds: free is below 30, occupied above 70."""
         free, occupied = 100 * self.free_below, 100 * self.occupied_above
         ends = [0, np.ceil(free) - 1, np.ceil(free), np.floor(occupied), np.floor(occupied) + 1, 100]
-        spread = np.interp(np.arange(256, dtype=np.uint8).view(np.int8), ends, [0, 29, 30, 70, 71, 100], left=UNKNOWN)
+        spread = np.interp(
+            np.arange(256, dtype=np.uint8).view(np.int8), ends, [0, 29, 30, 70, 71, 100], UNKNOWN, UNKNOWN
+        )
         return np.rint(spread).astype(np.int8)[self.cells.view(np.uint8)]
 
     @property

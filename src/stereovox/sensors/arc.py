@@ -30,7 +30,7 @@ class Arc:
     p_right: float = 0.9
     prior: float = 0.1
     trust: float = 0.8
-    p_free: float = 0.34
+    p_free: float = 0.345
     p_unknown: float = 0.5
 
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:

@@ -13,6 +13,8 @@ from stereovox_lab.checks.agreement import agreement
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
 HIT_OR_MISS = {"sensor.model": "constant", "map.prior": 0.5, "map.log_odds_min": -2.0}
 """Evidence that does not depend on depth: geometry alone decides."""
+WHOLE = {"projective.full_share": 0.0, "projective.edge_share": 1.0}
+"""What rays do: they weigh neither small hits nor edges."""
 
 
 @cache
@@ -30,6 +32,7 @@ def map_of(name, voxel_size, settings):
 
 def shares_of(name, voxel_size, **settings):
     """Agreement of a projective map with the map of exact rays, which is made once for all."""
+    settings = WHOLE | settings
     of_both = {key: value for key, value in settings.items() if not key.startswith("projective.")}
     rays = tuple({**of_both, "integrator": "ray", "ray.update": "once"}.items())
     return agreement(map_of(name, voxel_size, tuple(settings.items())), map_of(name, voxel_size, rays))

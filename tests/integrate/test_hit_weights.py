@@ -13,7 +13,7 @@ from stereovox.frame import DepthImage, Frame
 from stereovox.integrate import make_integrator
 from stereovox.sensors import make_sensor
 
-DEFAULT = load_config(voxel_size=0.4)
+WHOLE = load_config(voxel_size=0.4, **{"projective.full_share": 0.0})
 STRAIGHT = PinholeCamera(64, 48, 40.0, 40.0, 32.0, 24.0, 0.05)
 
 
@@ -88,7 +88,7 @@ def test_weight_by_hand(part, samples, full_share):
 @pytest.mark.parametrize("model", ["stereo", "constant"])
 def test_a_lone_wrong_pixel_is_less_than_a_surface_in_every_large_cell(model):
     more = {"sensor.model": model, "projective.full_share": 0.15}
-    integrator, as_told = make_integrator(load_config(voxel_size=0.4, **more)), make_integrator(DEFAULT)
+    integrator, as_told = make_integrator(load_config(voxel_size=0.4, **more)), make_integrator(WHOLE)
     in_full = hits_of(wall_with((slice(24, 40), slice(32, 48))), as_told)[0, 0, 2]
     surface = hits_of(wall_with((slice(24, 40), slice(32, 48))), integrator)[0, 0, 2]
     for v, u in [(25, 33), (30, 34), (33, 40), (38, 46)]:

@@ -32,7 +32,6 @@ METRES = 2.0
 """The baseline is in millimetres; a smaller number must be in metres."""
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 SINGLE = "single scenes without poses, each in its own world; map one, for example --frames 0:1"
-ONE_LOOK = "one image leaves surfaces tentative; with --set map.prior=0.3 it is enough for occupied"
 EXAMPLE = "'cam0=[f 0 cx; 0 f cy; 0 0 1]', 'cam1=[...]' and 'baseline=' in mm"
 
 
@@ -63,7 +62,7 @@ class TwoView(RigSource):
         shots = [Shot(i * SECOND_NS, i, *(scene / name for name in IMAGES)) for i, scene in enumerate(scenes)]
         poses = Poses([shot.stamp_ns for shot in shots], np.tile(UPRIGHT, (len(shots), 1, 1)), where=str(self.folder))
         self._set(Rig(pairs), self.folder, shots, poses, CALIBRATION)
-        self.notes = (f"{self.folder}: {ONE_LOOK}", *(note for some in notes for note in some))
+        self.notes = tuple(note for some in notes for note in some)
         if len(scenes) > 1:
             self.notes = (f"{self.folder}: {SINGLE}", *self.notes)
 

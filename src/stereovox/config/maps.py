@@ -48,7 +48,7 @@ class RayConfig(Section):
 
 
 class ProjectiveConfig(Section):
-    """How the projective integrator counts hits.
+    """How the projective integrator counts hits and passes.
 
     full_share: a hit counts in full if at least this share of the cell's footprint in the image measures the cell; a
         smaller share counts as its square root, since a few pixels may be wrong; 0: every hit counts in full.
@@ -76,6 +76,7 @@ class MapConfig(Section):
         tentative costs 1. A cell of probability p is free if p * missed_obstacle < 1, and occupied if
         (1 - p) * false_alarm < 1: the decision of least expected cost (Berger 1985, 4.4). This holds for a prior of
         0.1; with another one the thresholds move with it, so that the same evidence decides.
+        A cell at `log_odds_min` is free whatever it costs, if its probability is then below 0.3.
     free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied; not set: by
         the costs.
     forget_s: a cell without evidence for this many seconds of the recording becomes unknown; needs `keep_times`.
@@ -104,8 +105,8 @@ class MapConfig(Section):
         free_below, occupied_above = self.decision
         if free_below >= occupied_above:
             raise ValueError(
-                f"free below {free_below:.3g} and occupied above {occupied_above:.3g}: free_below must be smaller than "
-                "occupied_above, or missed_obstacle and false_alarm larger"
+                f"cells would be free below {free_below:.3g} and occupied above {occupied_above:.3g}; free_below must "
+                "be smaller than occupied_above: change one, or increase missed_obstacle or false_alarm"
             )
         if self.forget_s is not None and not self.keep_times:
             raise ValueError("forget_s needs keep_times = true")
@@ -121,7 +122,7 @@ class MapConfig(Section):
         if free is None:
             free = 1 / (1 + base * (self.missed_obstacle - 1))
         if occupied is None:
-            occupied = 1 - 1 / (1 + (self.false_alarm - 1) / base)
+            occupied = (self.false_alarm - 1) / (self.false_alarm - 1 + base)
         return Decision(free, occupied)
 
 

@@ -56,7 +56,7 @@ def checked_cloud(cloud: Cloud, config: Config) -> CheckedCloud:
     room = len(points) + len(clear)
     ends, starts, hits = np.empty((room, 3)), np.empty((room, 3)), np.zeros(room, bool)
     _check_unit(cloud, points, origins, clear, config)
-    own = cloud.lidar.range_min  # `min_range` is that of cameras, which a sonar is used to look nearer than
+    own = cloud.lidar.range_min  # `min_range` is the cameras' limit; sonars measure nearer
     nearest = own if isinstance(cloud.lidar, RangeSensor) else max(own, config.min_range)
     none = np.empty((0, 3)) if origins is None else origins
     farthest, reach = float(cloud.lidar.range_max), REACH_SIGMA * float(cloud.lidar.sigma)

@@ -18,7 +18,7 @@ from stereovox.sensors.model import REACH_SIGMA
 APART = 0.5
 """Distance between neighbouring rays at their end, in cells."""
 MOST = 1 << 18
-"""Most rays of one cone: beyond, cells between them stay as they are."""
+"""Most rays in one cone; if it needs more, cells between them are unchanged."""
 GOLDEN = pi * (3 - sqrt(5))
 
 

@@ -26,7 +26,8 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
     """
     mapped = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)
-    if taken_out := sum(report.taken_out for report in mapped):
+    taken_out = max((n for n, report in enumerate(mapped) if report.taken_out), default=0)
+    if taken_out:
         refused[UNCONFIRMED] += taken_out
     return {
         "frames": len(mapped) - taken_out,

@@ -236,5 +236,7 @@ class TruthCells:
 def level(threshold: float) -> float:
     """Return the log-odds that a cell must exceed to have p > threshold. Raises StereovoxError outside (0, 1)."""
     if not 0 < threshold < 1:
-        raise StereovoxError(f"threshold {threshold} is not a probability between 0 and 1; the usual one is 0.7")
+        raise StereovoxError(
+            f"threshold {threshold} is not a probability between 0 and 1; leave it out for the map's own"
+        )
     return log(threshold / (1 - threshold)) + _ROUNDING

@@ -47,9 +47,9 @@ def surface(voxel_map: VoxelMap) -> Mesh:
     """Extract the closed surface around the occupied cells: every occupied centre is inside, every other outside.
 
     Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface is where the log-odds,
-    linear between neighbouring cell centres, cross `map.occupied_above`. Unknown cells count as certainly free, so that
-    nothing is invented: towards them the surface reaches no farther than the occupied cell's own face. A wall seen from
-    one side still has two sides: it is as thick as its cells.
+    linear between neighbouring cell centres, cross the threshold of occupied cells. Unknown cells count as certainly
+    free, so that nothing is invented: towards them the surface reaches no farther than the occupied cell's own face. A
+    wall seen from one side still has two sides: it is as thick as its cells.
 
     Args:
         voxel_map: The map.

@@ -118,7 +118,7 @@ def binary_tree(voxel_map: VoxelMap) -> Tree:
 def full_tree(voxel_map: VoxelMap) -> Tree:
     """Return the map as OctoMap's full tree: every known cell with its log-odds, branches with their highest.
 
-    Log-odds are counted from the map's prior, since OctoMap's is one half: it takes all above 0 as occupied. Raises
+    Log-odds are counted from the map's prior, since OctoMap's is one half: it takes all from 0 on as occupied. Raises
     MapFileError for cells outside [-32768, 32768).
     """
     nodes = build_octree(*_evidence(voxel_map))

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from stereovox.files.safe_io import replacing
 from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
+from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.occupancy import Percent
 from stereovox.products.floor.floor_axes import heights_of
 
 PLY_POINT = np.dtype(
@@ -59,15 +61,15 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
     (M,) uint8 is JSON. Raises MapFileError if the file cannot be written.
     """
     indices, log_odds = voxel_map.cells()
-    prior, decision = voxel_map.config.map.prior, voxel_map.config.map.decision
+    percent = Percent(CellRules(voxel_map.config.map))
     with replacing(path) as file:
         np.savez_compressed(
             file,
             indices=indices,
             log_odds=log_odds,
             voxel_size=np.float64(voxel_map.voxel_size),
-            free_below=np.float64(min(decision.free_below, prior)),
-            occupied_above=np.float64(decision.occupied_above),
+            free_below=np.float64(percent.free_below),
+            occupied_above=np.float64(percent.occupied_above),
             settings=np.frombuffer(json.dumps(voxel_map.config.model_dump()).encode(), np.uint8),
         )
 

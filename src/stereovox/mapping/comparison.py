@@ -104,7 +104,7 @@ class Comparison:
         """Return what the gate needs to accept the frame; a cone is not compared, for it yields to the map.
 
         evidence: the evidence of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
-        `Gate.check_agreement`; not while the map is provisional, for either may be wrong: it then begins anew.
+        `Gate.check_agreement`; a provisional map may begin anew instead, for either may be wrong.
         """
         if not self._compares or isinstance(image.camera, RangeSensor):
             return passed

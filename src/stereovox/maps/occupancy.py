@@ -61,6 +61,7 @@ class OccupancyGrid:
         """`cells` for `nav_msgs/OccupancyGrid`, which has no thresholds: free is below 30, occupied above 70."""
         free, occupied = 100 * self.free_below, 100 * self.occupied_above
         ends = [0, np.ceil(free) - 1, np.ceil(free), np.floor(occupied), np.floor(occupied) + 1, 100]
+        ends = np.maximum.accumulate(ends)  # both thresholds may lie within one per cent
         spread = np.interp(
             np.arange(256, dtype=np.uint8).view(np.int8), ends, [0, 29, 30, 70, 71, 100], UNKNOWN, UNKNOWN
         )

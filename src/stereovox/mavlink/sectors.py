@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.cells.cell_format import CellRules
 from stereovox.products.floor.floor_axes import up_of, upright_axes
 
 SECTORS = 72
@@ -41,8 +42,6 @@ MAX_CELLS = 20_000_000
 """Most cells inspected for one message."""
 LEVEL_ERROR = 0.02
 """Length by which the map's `up` may miss its true direction (1.1 degrees)."""
-HAIR = 1e-3
-"""Error of a probability by the steps in which log-odds are stored."""
 STEEPEST = 0.1
 """Least horizontal length of the forward axis, a unit vector: 84 degrees of pitch."""
 UnknownAs = Literal["obstacle", "unmeasured"]
@@ -259,8 +258,9 @@ def _states(
     with voxel_map.lock:
         states = states_of(voxel_map, points, oldest_s)
         tentative = np.flatnonzero(states == State.TENTATIVE)
-        prior = voxel_map.config.map.prior
-        states[tentative[voxel_map.probability(points[tentative]) <= prior + HAIR]] = State.UNKNOWN
+        rules = CellRules(voxel_map.config.map)
+        prior = rules.format.log_odds(np.array(rules.prior))
+        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = State.UNKNOWN
     return states.reshape(shape)
 
 

@@ -117,7 +117,7 @@ def _faster(times: float | None) -> str:
 def _notes(result: dict[str, Any]) -> list[str]:
     notes = [
         "ms/frame: median time of the call that takes a frame in; making depth images or points is not part of it.",
-        "Cells as each library defines them: stereovox occupied above p = 0.7, free below 0.3; others parted at 0.5.",
+        "Cells as each library defines them: stereovox by its own thresholds, others parted at 0.5.",
     ]
     prepared = [row["depth_ms_median"] for row in result["rows"] if "depth_ms_median" in row]
     if prepared:

@@ -121,8 +121,8 @@ def bench(
     occupied, free, map_bytes, cpu_share` (processors kept busy while timed; a single thread that got clearly less than
     one had to wait for other programs); `variants`: rows like these of further ways to run stereovox;
     `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames, frames_refused,
-    first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and
-    free below 0.3 for stereovox, above and below 0.5 for the others.
+    first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: by its own thresholds for
+    stereovox, above and below 0.5 for the others.
     Raises ConfigError for an unknown or unusable peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError if no frame is usable or a peer fails: one line each.
     """

@@ -81,7 +81,7 @@ def test_every_library_gives_a_complete_row_with_cells_that_agree():
         assert 0 < row["integrate_ms_median"] <= 1.001 * row["integrate_ms_p90"] <= 1.002 * row["integrate_ms_p99"]
         ours = rows["stereovox", size]
         assert ours["occupied"] / 2 < row["occupied"] < 2 * ours["occupied"], library
-        assert ours["free"] / 2 < row["free"] < 2 * ours["free"], library
+        assert ours["free"] / 2 < row["free"] < 3 * ours["free"], library  # ours leaves a margin before surfaces
         if library != "stereovox":
             ratio = row["integrate_ms_median"] / ours["integrate_ms_median"]
             assert result["ratio"][str(size)][library] == pytest.approx(ratio, rel=1e-2)

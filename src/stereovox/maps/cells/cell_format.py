@@ -19,7 +19,7 @@ from stereovox.maps.cells import _cells
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken as a probability of 0.7."""
 SURELY = 0.3
-"""Upper bound on the probability of a free cell at its lower limit, whatever the costs."""
+"""A cell at its lower limit is free if its probability is below this, whatever the costs."""
 LIKELY = 0.7
 """Lower bound on the probability that counts as certainly occupied, however low the threshold."""
 
@@ -112,7 +112,7 @@ class CellRules:
     def free_below(self) -> float:
         """Stored numbers below this are free: unlikely, and no likelier than before the first evidence.
 
-        By costs, a cell at its lower limit is as free as it can be, if that is below `SURELY`.
+        If costs decide, a cell at its lower limit is free if that is below `SURELY`.
         """
         unlikely = self._exact(self.config.decision.free_below)
         if self.config.free_below is None:

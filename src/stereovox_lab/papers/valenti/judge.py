@@ -201,5 +201,5 @@ def _judged(
         }
     arrays, shown = None, None
     if series is not None:
-        arrays, shown = series.arrays(), outcomes(truths["view"].read(voxel_map), truths["view"])
+        arrays, shown = series.arrays(), outcomes(truths["view"].read(voxel_map), truths["view"], CALLED)
     return Judged(drive, name, setting, frames, scores, both, arrays, shown)

@@ -7,8 +7,11 @@ from stereovox import VoxelMap, load_config
 CELL = 0.1
 
 
-def hall(occupied=(), unknown=(), tentative=(), size=6.0, height=1.5, up="z"):
-    """A map, free within `size` metres of the origin and `height` up and down, but for boxes (low, high) in metres."""
+def hall(occupied=(), unknown=(), tentative=(), size=6.0, height=1.5, up="z", doubt=-1.5):
+    """A map, free within `size` metres of the origin and `height` up and down, but for boxes (low, high) in metres.
+
+    doubt: log-odds of tentative cells.
+    """
     config = load_config(voxel_size=CELL, up=up) if up != "z" else load_config(voxel_size=CELL)
     reach = np.array([size, size, size])
     upright = "xyz".index(up[-1])
@@ -17,7 +20,7 @@ def hall(occupied=(), unknown=(), tentative=(), size=6.0, height=1.5, up="z"):
     cells = np.indices(2 * n).reshape(3, -1).T - n
     odds, keep = np.full(len(cells), -3.0), np.ones(len(cells), bool)
     centres = (cells + 0.5) * CELL
-    for boxes, value in ((occupied, 3.0), (tentative, -1.5), (unknown, None)):
+    for boxes, value in ((occupied, 3.0), (tentative, doubt), (unknown, None)):
         for low, high in boxes:
             inside = ((centres > low) & (centres < high)).all(axis=1)
             if value is None:

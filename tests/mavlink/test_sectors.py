@@ -112,6 +112,14 @@ def test_tentative_is_an_obstacle():
     assert found.obstacle_m[0] == pytest.approx(2.0)
 
 
+def test_a_tentative_cell_no_likelier_than_before_is_no_obstacle_but_space_that_is_not_free_yet():
+    voxel_map = hall(tentative=[((2, -0.1, -1), (2.2, 0.1, 1))], doubt=-2.4)
+    assert voxel_map.state([[2.05, 0.05, 0.05]]) == State.TENTATIVE
+    found = obstacle_sectors(voxel_map, looking(0), EXACT)
+    assert found.unknown_m[0] == pytest.approx(2.0)
+    assert np.isinf(found.obstacle_m[0])
+
+
 def test_own_place_hides_unknown_cells_but_no_obstacles():
     around = ((-0.4, -0.4, -1), (0.4, 0.4, 1))
     rules = SectorRules(max_distance=3.0, own_radius=0.6, half_height=0.2)

@@ -248,26 +248,27 @@ def check_number_of_cells(low: NDArray[np.int64], high: NDArray[np.int64]) -> No
 def _states(
     voxel_map: VoxelMap, cell: NDArray[np.float64], low: NDArray[np.int64], high: NDArray[np.int64], oldest_s: float
 ) -> NDArray[np.uint8]:
-    """Return the states (i, j, k) of a box of cells; tentative cells no likelier than the prior are unknown."""
+    """Return the `states_of` a box of cells (i, j, k)."""
     shape = tuple(high - low + 1)
     centres = np.empty((*shape, 3))
     for axis in range(3):
         line = (low[axis] + np.arange(shape[axis]) + 0.5) * cell[axis]
         centres[..., axis] = line.reshape([-1 if other == axis else 1 for other in range(3)])
-    points = centres.reshape(-1, 3)
-    with voxel_map.lock:
-        states = states_of(voxel_map, points, oldest_s)
-        tentative = np.flatnonzero(states == State.TENTATIVE)
-        rules = CellRules(voxel_map.config.map)
-        prior = rules.format.log_odds(np.array(rules.prior))
-        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = State.UNKNOWN
-    return states.reshape(shape)
+    return states_of(voxel_map, centres.reshape(-1, 3), oldest_s).reshape(shape)
 
 
 def states_of(voxel_map: VoxelMap, points: NDArray[np.float64], oldest_s: float) -> NDArray[np.uint8]:
-    """Return the states (N,) of points (N, 3); free ones whose evidence is older than `oldest_s` are unknown."""
+    """Return the states (N,) of points (N, 3).
+
+    What is not free yet is unknown: tentative cells no likelier than the prior, and free ones whose evidence is older
+    than `oldest_s`.
+    """
+    rules = CellRules(voxel_map.config.map)
+    prior = rules.format.log_odds(np.array(rules.prior))
     with voxel_map.lock:
         states = voxel_map.state(points)
+        tentative = np.flatnonzero(states == State.TENTATIVE)
+        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = State.UNKNOWN
         if oldest_s < inf:
             free = np.flatnonzero(states == State.FREE)
             states[free[~(voxel_map.age(points[free]) <= oldest_s)]] = State.UNKNOWN

@@ -395,7 +395,7 @@ def flat_cone(
         edge = size / np.maximum(away, size)
         within = angle < half - edge
         if within.all() and beam.range_min < away.min() and away.max() < distance - 4 * beam.sigma:
-            before[tuple(cell.tolist())] = np.log(0.4 / 0.6)
+            before[tuple(cell.tolist())] = np.log(0.345 / 0.655)
         elif (np.abs(away - distance) < size / 40)[within].sum() >= 16:
             arc[tuple(cell.tolist())] = value
         elif (angle > half + 1e-6).all() or away.min() > distance or away.max() < beam.range_min:

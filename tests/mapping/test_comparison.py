@@ -71,7 +71,8 @@ def test_points_beyond_the_map_do_not_count(far_m):
         reports = [mapper.add(replace(cloud, points=np.concatenate([cloud.points, more]))) for cloud in clouds]
         found.append(([report.refused for report in reports], mapper.map.counts()["occupied"]))
     assert found[0][0] == [None, None, None, "disagrees_with_map", None]
-    assert found[0] == found[1]
+    assert found[0][0] == found[1][0]
+    assert found[1][1] == pytest.approx(found[0][1], rel=0.03)  # what comes before them is seen through
 
 
 def test_a_saved_map_holds_no_cells_that_cannot_be_read(tmp_path):

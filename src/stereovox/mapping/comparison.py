@@ -24,11 +24,11 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.query.queries import RayHits
 from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import DisagreementSpell
+from stereovox.maps.voxel_map import leaning
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
 from stereovox.sensors.noise import RangeNoise
 
-SURFACES = (State.OCCUPIED, State.TENTATIVE)
 FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""
 GLANCED, POINTS, TRIED = 2000, 500, 100
@@ -232,8 +232,8 @@ def _placed(
     gap = away - np.where(np.isfinite(first), first, np.inf)
     through = gap > tolerance + DEEP_CELLS * voxel_map.voxel_size
     midway = np.where(through, (1 - 0.5 * gap / away), 1.0)
-    between = voxel_map.state(T[:3, 3] + rays * midway[:, None]) == State.FREE
-    free = voxel_map.state(T[:3, 3] + rays) == State.FREE
+    between = _states(voxel_map, T[:3, 3] + rays * midway[:, None]) == State.FREE
+    free = _states(voxel_map, T[:3, 3] + rays) == State.FREE
     return Placed(agrees, ~agrees & (through | free), agrees & through & between, first / away)
 
 
@@ -247,7 +247,12 @@ def _on_surface(
     step = (tolerance / np.maximum(np.linalg.norm(points, axis=-1), 1e-9))[..., None]
     tried = np.stack([points * (1 + k * step) for k in np.linspace(-1, 1, tries)])
     placed = tried.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
-    return np.any(voxel_map.state(placed).reshape(tried.shape[:-1]) >= State.TENTATIVE, axis=0)
+    return np.any(_states(voxel_map, placed).reshape(tried.shape[:-1]) >= State.TENTATIVE, axis=0)
+
+
+def _states(surfaces: Surfaces, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return the states (N,) of points (N, 3), free also where evidence leans to that without deciding."""
+    return leaning(surfaces, points, State.FREE) if isinstance(surfaces, VoxelMap) else surfaces.state(points)
 
 
 def _fault(
@@ -314,7 +319,7 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: AnyImage) -> Transform | None:
     T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
     for reach in np.geomspace(REACH_M, last, STEPS):
         there, planes = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
-        found = voxel_map.nearest_obstacle(there, float(reach), SURFACES) if len(there) else None
+        found = voxel_map.nearest_obstacle(there, float(reach)) if len(there) else None
         near = np.isfinite(found.distance) if found else np.zeros(0, bool)
         if found is None or near.sum() < MIN_POINTS:
             return None

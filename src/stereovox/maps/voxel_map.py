@@ -13,6 +13,7 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.kernels.threads import Guarded
+from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.cell_format import State as State
 from stereovox.maps.cells.cell_times import NEVER
 from stereovox.maps.cells.evidence import Evidence
@@ -457,3 +458,14 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
     if cells.size and not (cells.min() >= -INDEX_LIMIT and cells.max() <= INDEX_LIMIT):
         raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give at most 2^30 either way")
     return cells.astype(np.int64, copy=False)
+
+
+def leaning(voxel_map: VoxelMap, points: ArrayLike, unlikely: State) -> NDArray[np.uint8]:
+    """Return the states (N,) of points (N, 3), `unlikely` for tentative cells that are no likelier than the prior."""
+    points, rules = np.asarray(points, float), CellRules(voxel_map.config.map)
+    prior = rules.format.log_odds(np.array(rules.prior))
+    with voxel_map.lock:
+        states = voxel_map.state(points)
+        tentative = np.flatnonzero(states == State.TENTATIVE)
+        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = unlikely
+    return states

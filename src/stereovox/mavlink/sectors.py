@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cells.cell_format import CellRules
+from stereovox.maps.voxel_map import leaning
 from stereovox.products.floor.floor_axes import up_of, upright_axes
 
 SECTORS = 72
@@ -263,12 +263,8 @@ def states_of(voxel_map: VoxelMap, points: NDArray[np.float64], oldest_s: float)
     What is not free yet is unknown: tentative cells no likelier than the prior, and free ones whose evidence is older
     than `oldest_s`.
     """
-    rules = CellRules(voxel_map.config.map)
-    prior = rules.format.log_odds(np.array(rules.prior))
     with voxel_map.lock:
-        states = voxel_map.state(points)
-        tentative = np.flatnonzero(states == State.TENTATIVE)
-        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = State.UNKNOWN
+        states = leaning(voxel_map, points, State.UNKNOWN)
         if oldest_s < inf:
             free = np.flatnonzero(states == State.FREE)
             states[free[~(voxel_map.age(points[free]) <= oldest_s)]] = State.UNKNOWN

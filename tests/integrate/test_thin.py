@@ -36,7 +36,7 @@ def test_a_thin_pole_stays(name):
 @pytest.mark.parametrize(
     ("name", "broken"),
     [
-        ("half a pixel, exact", {"sensor.passes": 1.0}),
+        ("half a pixel, exact", {"sensor.passes": 1.0, "projective.edge_share": 1.0}),
         ("rays", {"ray.update": "every"}),
         ("nearer than the camera sees", {"blind_range": 0.0}),
     ],

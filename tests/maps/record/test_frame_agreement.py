@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.maps import State, VoxelMap
+from stereovox.maps import VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.record import frame_agreement
 from stereovox.maps.record.frame_agreement import FEW, KNOWN, SEEN_THROUGH, Agreement
@@ -37,24 +37,24 @@ def slow(voxel_map, evidence):
     stored = {tuple(c): cells for c, cells in zip(*voxel_map.storage.blocks(), strict=True)}
     rules = voxel_map.storage.rules
     free_most, occupied_least = map(int, rules.thresholds)
+    unlikely = min(int(rules.prior), int(rules.format.stored(np.log(0.3 / 0.7))))
     likely = max(occupied_least, int(rules.format.stored(np.log(0.7 / 0.3))))
     spoken = [*zip(evidence.coords, evidence.values, strict=True)]
     spoken += [(c, np.full(512, step)) for c, step in zip(evidence.uniform, evidence.uniform_values, strict=True)]
     for coords, values in spoken:
         cells = stored.get(tuple(coords), np.full(512, rules.format.unknown)).astype(int).reshape(8, 8, 8)
         known = cells != rules.format.unknown
-        states = rules.states(cells)
         for x, y, z in np.ndindex(8, 8, 8):
             value, number = int(values[64 * x + 8 * y + z]), cells[x, y, z]
             if value >= FIRM:
                 out["every"] += value
             if not known[x, y, z]:
                 continue
-            if states[x, y, z] == State.OCCUPIED and value > 0:
+            if number >= likely and value > 0:
                 out["hits"] += value
             if number >= (likely + int(rules.highest)) / 2 and value < 0:
                 out["passes"] -= value
-            if number <= (free_most + int(rules.lowest)) // 2 and value >= FIRM:
+            if number <= min(free_most, (unlikely + int(rules.lowest)) // 2) and value >= FIRM:
                 out["into_free"] += value
                 around = [(x - 1, y, z), (x + 1, y, z), (x, y - 1, z), (x, y + 1, z), (x, y, z - 1), (x, y, z + 1)]
                 if any(min(at) >= 0 and max(at) < 8 and not known[at] for at in around):

@@ -18,7 +18,7 @@ from stereovox.maps.cells import _cells
 
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken as a probability of 0.7."""
-SURELY = 0.3
+UNLIKELY = 0.3
 """A cell at its lower limit is free if its probability is below this, whatever the costs."""
 LIKELY = 0.7
 """Lower bound on the probability that counts as certainly occupied, however low the threshold."""
@@ -112,11 +112,11 @@ class CellRules:
     def free_below(self) -> float:
         """Stored numbers below this are free: unlikely, and no likelier than before the first evidence.
 
-        If costs decide, a cell at its lower limit is free if that is below `SURELY`.
+        If costs decide, a cell at its lower limit is free if that is below `UNLIKELY`.
         """
         unlikely = self._exact(self.config.decision.free_below)
         if self.config.free_below is None:
-            unlikely = max(unlikely, min(float(self.lowest) + 0.5, self._exact(SURELY)))
+            unlikely = max(unlikely, min(float(self.lowest) + 0.5, self._exact(UNLIKELY)))
         return min(unlikely, float(self.prior) + 0.5)
 
     @cached_property
@@ -150,30 +150,18 @@ class CellRules:
 
     @cached_property
     def sure(self) -> tuple[np.int16, np.int16, np.int16]:
-        """The highest certainly free stored number, the lowest occupied one, and the lowest certainly occupied one.
+        """The highest certainly free stored number, the lowest likely occupied one, and the lowest certainly occupied
+        one: how frames are compared with the map, whatever wrong decisions cost.
 
-        Certain means past the middle between its threshold, and at least LIKELY, and its limit. No certain number is
-        "unknown" or beyond it.
+        Likely is at least LIKELY, and unlikely at most UNLIKELY and the prior. Certain means past the middle between
+        these and the limit. No certain number is "unknown" or beyond it.
         """
         unknown, (free_most, occupied_least) = self.format.unknown, map(int, self.thresholds)
-        surely_free = min((free_most + int(self.lowest)) // 2, unknown - 1)
-        occupied = max(occupied_least, unknown + 1)
-        likely = max(occupied_least, int(self.format.stored(log(LIKELY / (1 - LIKELY)))))
-        surely_occupied = max(-(-(likely + int(self.highest)) // 2), occupied)
-        return np.int16(surely_free), np.int16(occupied), np.int16(surely_occupied)
-
-    def yielding(self, values: NDArray[np.signedinteger], stored: NDArray[np.integer], again: bool) -> NDArray:
-        """Return weak evidence for cells that hold `stored`, of the same shape; zero where it yields to the map.
-
-        It clears no surely occupied cell, and adds to no occupied one. again: it repeats what was added before, so only
-        what is for something in a free cell counts.
-        """
-        cells = stored.astype(np.int32)
-        if again:
-            counts = (values > 0) & (cells <= self.thresholds.free_most) & (cells != self.format.unknown)
-        else:
-            counts = np.where(values > 0, cells < self.thresholds.occupied_least, cells < self.sure[2])
-        return np.where(counts, values, values.dtype.type(0))
+        unlikely = min(int(self.prior), int(self.format.stored(log(UNLIKELY / (1 - UNLIKELY)))))
+        surely_free = min(free_most, (unlikely + int(self.lowest)) // 2, unknown - 1)
+        likely = max(occupied_least, unknown + 1, int(self.format.stored(log(LIKELY / (1 - LIKELY)))))
+        surely_occupied = -(-(likely + int(self.highest)) // 2)
+        return np.int16(surely_free), np.int16(likely), np.int16(max(surely_occupied, likely))
 
     def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Return the `State` of stored numbers, uint8 of the same shape."""

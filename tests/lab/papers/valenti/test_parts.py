@@ -19,7 +19,7 @@ from stereovox_lab.papers.valenti.apart import Apart, apart
 from stereovox_lab.papers.valenti.claims import CLAIMED, claims_of, results, speed_claim
 from stereovox_lab.papers.valenti.course import course_claims, rank_correlation
 from stereovox_lab.papers.valenti.figures import THRESHOLDS, at
-from stereovox_lab.papers.valenti.judge import Judged
+from stereovox_lab.papers.valenti.judge import CALLED, Judged
 from stereovox_lab.papers.valenti.mappers import (
     DEFAULT,
     OCTOMAP,
@@ -53,7 +53,7 @@ SURFACE = CELLS[:, 0] % 6 == 0
 def judged(mapper: str, log_odds: np.ndarray, setting: Setting = SETTING, drive: str = "drive") -> Judged:
     config = load_config(voxel_size=setting.voxel_size, **{"map.log_odds_min": -6.0, "map.log_odds_max": 6.0})
     truth = VoxelMap.from_cells(config, CELLS, np.where(SURFACE, 6.0, -6.0))
-    scores = score(VoxelMap.from_cells(config, CELLS, log_odds), truth, thresholds=THRESHOLDS)
+    scores = score(VoxelMap.from_cells(config, CELLS, log_odds), truth, CALLED, thresholds=THRESHOLDS)
     return Judged(drive, mapper, setting, 1, {"view": scores, "rays": scores})
 
 

@@ -163,6 +163,19 @@ class CellRules:
         surely_occupied = -(-(likely + int(self.highest)) // 2)
         return np.int16(surely_free), np.int16(likely), np.int16(max(surely_occupied, likely))
 
+    def yielding(self, values: NDArray[np.signedinteger], stored: NDArray[np.integer], again: bool) -> NDArray:
+        """Return weak evidence for cells that hold `stored`, of the same shape; zero where it yields to the map.
+
+        It clears no surely occupied cell, and adds to no occupied one. again: it repeats what was added before, so only
+        what is for something in a free cell counts.
+        """
+        cells = stored.astype(np.int32)
+        if again:
+            counts = (values > 0) & (cells <= self.thresholds.free_most) & (cells != self.format.unknown)
+        else:
+            counts = np.where(values > 0, cells < self.thresholds.occupied_least, cells < self.sure[2])
+        return np.where(counts, values, values.dtype.type(0))
+
     def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Return the `State` of stored numbers, uint8 of the same shape."""
         free_most, occupied_least = map(int, self.thresholds)

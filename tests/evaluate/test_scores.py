@@ -225,7 +225,7 @@ def test_what_came_of_each_cell():
     truth = {(0, 0, 0): True, (1, 0, 0): False, (4, 0, 0): False, (7, 0, 0): True, (10, 0, 0): True, (9, 0, 0): False}
     ours = {(0, 0, 0): 2.0, (1, 0, 0): 2.0, (4, 0, 0): 2.0, (7, 0, 0): -1.0}
     cells = TruthCells(made_truth(truth))
-    shown = outcomes(cells.read(made(ours)), cells)
+    shown = outcomes(cells.read(made(ours)), cells, 0.7)
     found = {tuple(cell): Outcome(o) for cell, o in zip(shown.cells.tolist(), shown.outcome, strict=True)}
     assert found == {
         (0, 0, 0): Outcome.HIT,
@@ -234,7 +234,7 @@ def test_what_came_of_each_cell():
         (7, 0, 0): Outcome.MISSED,
         (10, 0, 0): Outcome.UNSEEN,
     }
-    shown = outcomes(cells.read(made({(9, 0, 0): 2.0})), cells)
+    shown = outcomes(cells.read(made({(9, 0, 0): 2.0})), cells, 0.7)
     assert Outcome.FOUND in shown.outcome
     assert Outcome.UNSEEN in shown.outcome
 

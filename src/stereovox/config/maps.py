@@ -89,7 +89,7 @@ class MapConfig(Section):
     cell: Literal["int16", "int8", "uint8"] = "int16"
     log_odds_min: float = Field(-4.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
-    prior: float = Field(0.1, gt=0, lt=1)
+    prior: float = Field(BASE_RATE, gt=0, lt=1)
     missed_obstacle: float = Field(18.0, gt=1, le=1e6)
     false_alarm: float = Field(1.4, gt=1, le=1e6)
     free_below: float | None = Field(None, gt=0, lt=1)

@@ -40,7 +40,7 @@ class ByDistance:
 
 
 def by_distance(
-    reading: Reading, truth: TruthCells, path: ArrayLike, threshold: float = 0.7, edges: ArrayLike | None = None
+    reading: Reading, truth: TruthCells, path: ArrayLike, threshold: float, edges: ArrayLike | None = None
 ) -> ByDistance:
     """Compute precision and recall by distance to the nearest camera position.
 

@@ -39,7 +39,7 @@ class Outcomes:
     up: str
 
 
-def outcomes(reading: Reading, truth: TruthCells, threshold: float = 0.7) -> Outcomes:
+def outcomes(reading: Reading, truth: TruthCells, threshold: float) -> Outcomes:
     """Return the outcome of each cell of the truth that the truth or the map calls occupied."""
     marked, actual = reading.marked(threshold), truth.occupied
     outcome = np.where(truth.near, Outcome.NEAR, Outcome.FALSE).astype(np.uint8)

@@ -132,8 +132,7 @@ def full_tree(voxel_map: VoxelMap) -> Tree:
 def _evidence(voxel_map: VoxelMap) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Return the known cells (N, 3) and their log-odds (N,) from even odds on: without the prior."""
     indices, log_odds = voxel_map.cells()
-    rules = CellRules(voxel_map.config.map)
-    return indices, log_odds - rules.format.log_odds(np.array(rules.prior))
+    return indices, log_odds - CellRules(voxel_map.config.map).prior_log_odds
 
 
 class Tree(NamedTuple):

@@ -31,7 +31,7 @@ nearness, seen_through, farthest_of = (
     on_gpu(_windows.seen_through),
     on_gpu(_windows.farthest_of),
 )
-has_finer, clear_to = on_gpu(_windows.has_finer), on_gpu(_windows.clear_to)
+next_is_coarser, clear_to = on_gpu(_windows.next_is_coarser), on_gpu(_windows.clear_to)
 touched, classify, passed_by, end_of_view = (
     on_gpu(_projective._touched), on_gpu(_projective._classify), on_gpu(_projective._passed),
     on_gpu(_projective._end_of_view),
@@ -100,7 +100,7 @@ def widen_clear(base, windows, table):
     for level in range(windows.first, COARSEST + 1):
         rows, columns = shape[level, 0], shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, pitch, windows.height)
-        finer = 1 if has_finer(level) else 0
+        finer = 1 if next_is_coarser(level) else 0
         coarser = max(level + finer, 1)
         source = place(np.int32(coarser), ZERO, ZERO, pitch, windows.height)
         for i in range(cuda.grid(1), rows * columns, cuda.gridsize(1)):

@@ -63,14 +63,14 @@ def build(depth_m, windows, table, scratch):
                 _farthest_of_three(above, here, below, columns, row, out)
             if not table.edges:
                 clear = out
-            elif not has_finer(level):
-                _clear_of_three(above, here, below, columns, table, row, clear)
-                _not_through(out, columns, clear)
             else:
-                if v % 2 == 0:
-                    above, here, below = _three_rows(base, shape, pitch, level + 1, v >> 1)
-                    _clear_of_three(above, here, below, shape[level + 1, 1], table, row, other)
-                _doubled(other, columns, clear)
+                if next_is_coarser(level):
+                    if v % 2 == 0:
+                        above, here, below = _three_rows(base, shape, pitch, level + 1, v >> 1)
+                        _clear_of_three(above, here, below, shape[level + 1, 1], table, row, other)
+                    _doubled(other, columns, clear)
+                else:
+                    _clear_of_three(above, here, below, columns, table, row, clear)
                 _not_through(out, columns, clear)
             _take_in(out, clear, columns, v, high_row, low_row)
             if v % 16 == 15 or v == rows - 1:
@@ -84,7 +84,7 @@ def build(depth_m, windows, table, scratch):
 
 
 @cell
-def has_finer(level):
+def next_is_coarser(level):
     """Return whether the tiles of a level are half as wide as those of the next; both of level 0 and 1 are pixels."""
     return (level > 0) & (level < COARSEST)
 

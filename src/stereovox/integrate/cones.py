@@ -37,7 +37,7 @@ def cone_evidence(seen: Range, config: Config, origin: ArrayLike = (0.0, 0.0, 0.
     rays = level * np.column_stack([np.cos(angles), np.sin(angles)])
     since, until = beam.range_min, min(far - REACH_SIGMA * beam.sigma, config.max_range)
     free = np.hstack([_cells(T, rays, metres, size) for metres in (since, until)])[: number if since < until else 0]
-    arc = np.unique(np.floor(_cells(T, rays, far, size)), axis=0).astype(np.int64)[: None if heard else 0]
+    arc = np.unique(np.floor(_cells(T, rays if heard else rays[:0], far, size)), axis=0).astype(np.int64)
     if not len(free) + len(arc):
         return GridEvidence.nothing()
     ends = np.concatenate([np.floor(free.reshape(-1, 2)).astype(np.int64), arc])

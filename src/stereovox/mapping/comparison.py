@@ -186,7 +186,7 @@ def sight(
     search for another pose.
     """
     points = thinned(seen, POINTS)
-    tolerance = _tolerance(surfaces, points, sigma)
+    tolerance = np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
     placed = _placed(surfaces, T, points, tolerance)
     against = placed.against
     known = int((placed.agrees | against).sum())
@@ -196,12 +196,6 @@ def sight(
         votes, frames = doubt.glance.votes(points[against], T, BLUR * tolerance[against]), doubt.frames
     wrong = fault(points, tolerance, placed, frames % EVERY == 0)
     return Sight(anchored, wrong, int(against.sum()), int(placed.behind.sum()), votes, Glance.at(seen, T))
-
-
-def _tolerance(
-    surfaces: Surfaces, points: NDArray[np.float64], sigma: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    return np.maximum(surfaces.voxel_size, sigma(np.linalg.norm(points, axis=1)))
 
 
 class Placed(NamedTuple):

@@ -13,7 +13,6 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.kernels.threads import Guarded
-from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.cell_format import State as State
 from stereovox.maps.cells.cell_times import NEVER
 from stereovox.maps.cells.evidence import Evidence
@@ -462,10 +461,9 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
 
 def leaning(voxel_map: VoxelMap, points: ArrayLike, unlikely: State) -> NDArray[np.uint8]:
     """Return the states (N,) of points (N, 3), `unlikely` for tentative cells that are no likelier than the prior."""
-    points, rules = np.asarray(points, float), CellRules(voxel_map.config.map)
-    prior = rules.format.log_odds(np.array(rules.prior))
+    points = np.asarray(points, float)
     with voxel_map.lock:
         states = voxel_map.state(points)
         tentative = np.flatnonzero(states == State.TENTATIVE)
-        states[tentative[voxel_map.log_odds(points[tentative]) <= prior]] = unlikely
+        states[tentative[voxel_map.log_odds(points[tentative]) <= voxel_map.storage.rules.prior_log_odds]] = unlikely
     return states

@@ -65,7 +65,7 @@ def test_the_charts_show_something(truth, ours):
 
 
 def test_the_top_view_has_the_colours_of_what_is_there(truth, ours):
-    image = drawn(outcomes_png(outcomes(truth.read(ours), truth)))
+    image = drawn(outcomes_png(outcomes(truth.read(ours), truth, 0.7)))
     assert all(holds(image, colour) for colour in (RIGHT, WRONG, MISS))
     missed = Outcomes(np.array([[0, 0, 0], [3, 9, 0]], np.int32), np.full(2, Outcome.MISSED, np.uint8), 0.5, "z")
     legend_only = drawn(outcomes_png(missed))
@@ -89,7 +89,7 @@ def test_a_column_mixes_the_colours_of_its_cells():
 
 
 def test_the_page_has_every_result_and_needs_no_other_file(truth, ours):
-    shown = outcomes(truth.read(ours), truth)
+    shown = outcomes(truth.read(ours), truth, 0.7)
     results = [
         Evaluated("one <b>", score(ours, truth), series(truth, ours), shown),
         Evaluated("two", score(ours, truth, 0.5)),

@@ -108,6 +108,11 @@ class CellRules:
         p = self.config.prior
         return np.int32(np.clip(self.format.stored(log(p / (1 - p))), self.lowest, self.highest))
 
+    @property
+    def prior_log_odds(self) -> np.float32:
+        """Log-odds from which a cell starts, as they are stored."""
+        return self.format.log_odds(np.array(self.prior))[()]
+
     @cached_property
     def free_below(self) -> float:
         """Stored numbers below this are free: unlikely, and no likelier than before the first evidence.

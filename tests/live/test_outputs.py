@@ -53,7 +53,7 @@ def test_the_2d_map_is_written_while_it_grows_and_complete_at_the_end(tmp_path):
 
 
 def test_nothing_is_written_of_a_map_that_no_second_frame_has_confirmed(tmp_path):
-    mapper, said = Mapper(**SETTINGS, **{"scan.floor": 0.0}), []
+    mapper, said = Mapper(**SETTINGS, clock=lambda: 10**9, **{"scan.floor": 0.0}), []
     grid = GridFile(mapper, tmp_path / "g.yaml", (0.8, 1.2), period_s=0.0, notify=said.append)
     sphere = LiveSphere(mapper.config, {"front": T_BODY_OPTICAL}, mapper=mapper)
     written = []

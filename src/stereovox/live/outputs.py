@@ -99,8 +99,8 @@ class GridFile:
             self._write()
 
     def finish(self) -> None:
-        """Write the complete 2-D map."""
-        self._write()
+        """Write the complete 2-D map, by the floor that the whole run has shown."""
+        self._write(last=True)
         if self._busy is not None:
             self._busy.result()
 
@@ -116,10 +116,10 @@ class GridFile:
             self._notify(f"{self._file}: is not updated, since the map is {why}")
         return not why
 
-    def _write(self) -> None:
+    def _write(self, last: bool = False) -> None:
         self._new = False
         try:
-            grid = self._projection.grid()
+            grid = self._projection.grid(last)
         except StereovoxError as error:
             self._fail(str(error))
             return

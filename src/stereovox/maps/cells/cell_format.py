@@ -109,9 +109,9 @@ class CellRules:
         return np.int32(np.clip(self.format.stored(log(p / (1 - p))), self.lowest, self.highest))
 
     @property
-    def prior_log_odds(self) -> np.float32:
+    def prior_log_odds(self) -> float:
         """Log-odds from which a cell starts, as they are stored."""
-        return self.format.log_odds(np.array(self.prior))[()]
+        return float(self.format.log_odds(np.array(self.prior)))
 
     @cached_property
     def free_below(self) -> float:

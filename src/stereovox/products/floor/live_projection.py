@@ -90,12 +90,15 @@ class LiveProjection:
         """The floor that heights were last measured from."""
         return self._floor
 
-    def grid(self) -> OccupancyGrid | None:
+    def grid(self, last: bool = False) -> OccupancyGrid | None:
         """Return the current map from above, None if nothing is known. Its cells are a copy.
 
-        Raises StereovoxError for too large a grid.
+        last: find the floor in what the map has become, even if it was found less than `floor_s` ago. Raises
+        StereovoxError for too large a grid.
         """
         with self._map.lock:  # `_note` is called with it held
+            if last:
+                self._due = -np.inf
             self._seek_floor()
             return self._grid()
 

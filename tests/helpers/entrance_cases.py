@@ -373,7 +373,7 @@ RECIPES: dict[tuple[str, int], Callable[[str], list[Case]]] = {
         *_posed(lambda T: _at(T, 0, 3, np.nan))(kind), *_posed(lambda T: _at(T, 1, 1, np.inf))(kind)
     ],
     ("pose_too_far", 0): _posed(lambda T: _at(T, 1, 3, -1e6)),
-    ("pose_too_far", 1): _posed(lambda T: _at(T, 1, 3, 9e5), voxel_size=0.0005, max_range=1.0),
+    ("pose_too_far", 1): _posed(lambda T: _at(T, 1, 3, 9e5), voxel_size=0.0005, max_range=0.2),
     ("pose_not_rigid", 0): _posed(_scaled),
     ("mount_not_rigid", 0): _posed(_scaled, "T_base_sensor"),
     ("mount_too_far", 0): _posed(lambda T: _at(T, 0, 3, 2e6), "T_base_sensor"),

@@ -25,12 +25,19 @@ def made_image(seed: int, camera: VirtualCamera = CAMERA, far_share: float = 0.1
     return DepthImage(depth.astype(np.float32), reason.astype(np.uint8), camera, T)
 
 
+def rows_of(evidence):
+    """Evidence as rows (N, 4) of a cell and its thousandths, the same for the same cells whatever the blocks' order."""
+    coords = np.concatenate([evidence.coords, evidence.uniform])
+    order = np.lexsort(coords.T)
+    assert (np.diff(coords[order], axis=0) != 0).any(axis=1).all(), "a block stands in the evidence twice"
+    uniform = np.repeat(evidence.uniform_values[:, None], 512, axis=1)
+    values = np.concatenate([evidence.values, uniform])[order]
+    block, column = np.nonzero(values)
+    cells = coords[order][block] * 8 + np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
+    return np.column_stack([cells, values[block, column]])
+
+
 def cells_of(evidence):
     """Evidence as a dict from cell to thousandths."""
-    coords = np.concatenate([evidence.coords, evidence.uniform])
-    uniform = np.repeat(evidence.uniform_values[:, None], 512, axis=1)
-    values = np.concatenate([evidence.values, uniform])
-    assert len(np.unique(coords, axis=0)) == len(coords), "a block stands in the evidence twice"
-    block, column = np.nonzero(values)
-    cells = coords[block] * 8 + np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
-    return dict(zip(map(tuple, cells.tolist()), values[block, column].tolist(), strict=True))
+    rows = rows_of(evidence)
+    return dict(zip(map(tuple, rows[:, :3].tolist()), rows[:, 3].tolist(), strict=True))

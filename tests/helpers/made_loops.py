@@ -51,10 +51,23 @@ class _ShowNothing(dict):
         return None
 
 
+def blind(closer):
+    """Return a new closer that sees nothing in its frames."""
+    closer.shapes = _ShowNothing()
+    return closer
+
+
+def follow(closer, location, end):
+    """Let a closer take in every second pose of a simulated walk, up to frame `end`, without images."""
+    simulation = Simulation(location)
+    for i in range(0, end, 2):
+        stamp_ns, T = i * simulation.period_ns, simulation.pose(i)
+        closer.add(SimpleNamespace(sensor="", stamp_ns=stamp_ns, T_world_sensor=T, pose_sigma=(0, 0)))
+
+
 def bare_closer(R_world_level=None, **settings):
     """A closer that has taken in frames along a bent way, one submap each; z of the level world is up."""
-    made = LoopCloser(load_config(**settings))
-    made.shapes = _ShowNothing()
+    made = blind(LoopCloser(load_config(**settings)))
     turn = np.eye(4)
     turn[:3, :3] = np.eye(3) if R_world_level is None else R_world_level
     for i in range(30):

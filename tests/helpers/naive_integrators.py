@@ -44,8 +44,8 @@ def _shared(image: DepthImage, config: Config, sensor: InverseSensorModel, depth
         return _strongest(indices, evidence)
     focal_px = image.camera.focal_px / image.camera.binning
     weight = np.minimum(1.0, (depths / (focal_px * config.voxel_size)) ** 2)  # Chien 2020, Eq 3.21
-    cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
-    return _known(cells, np.bincount(of_cell.ravel(), weight * evidence))
+    cells, of_cell = _distinct(indices)
+    return _known(cells, np.bincount(of_cell, weight * evidence))
 
 
 def cast_points(cloud: CheckedCloud, config: Config, sensor: InverseSensorModel) -> Cells:
@@ -90,7 +90,7 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
     everything in an area about twice as wide.
     """
     table = _table(image, config, sensor)
-    hits, hit_evidence = _weighed(np.unique(_hit_cells(image, config), axis=0), image, config, table)
+    hits, hit_evidence = _weighed(_distinct(_hit_cells(image, config))[0], image, config, table)
     cells = _cells_in_range(image, config)
     pixels, z, size_px, seen = _projected(cells, image, config)
     cells, pixels, z, size_px = cells[seen], pixels[seen], z[seen], size_px[seen]
@@ -266,15 +266,20 @@ def _window(image: DepthImage, uv: NDArray, size_px: NDArray) -> tuple[NDArray, 
         tiles.append(np.where(open_ones, nearest_ones, 0))
     level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, MAX_LEVEL).astype(int)
     u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
-    farthest, nearest = depth[v, u], np.empty(len(uv))
-    for i, own in enumerate(level):
-        if own > 0:
-            farthest[i] = _around(tiles[own], v[i] >> (own - 1), u[i] >> (own - 1)).max()
-        side = 2 ** (min(own + 1, MAX_LEVEL) - 1)
-        rows, columns = (slice(max(at // side - 1, 0) * side, (at // side + 2) * side) for at in (v[i], u[i]))
-        some = depth[rows, columns]
-        nearest[i] = some[some > 0].min(initial=np.inf)
-    return farthest, nearest
+    side = 2 ** np.maximum(level - 1, 0)
+    places, of_place = _distinct(np.stack([level, v // side, u // side], axis=1))  # cells of one tile see the same
+    looked = np.array([_looked_at(depth, tiles, *place) for place in places]).reshape(-1, 2)
+    return looked[of_place, 0], looked[of_place, 1]
+
+
+def _looked_at(depth: NDArray, tiles: list[NDArray], level: int, row: int, column: int) -> tuple[float, float]:
+    """Return what `_window` does, for a tile of a level, or a pixel at level 0."""
+    farthest = _around(tiles[level], row, column).max() if level > 0 else depth[row, column]
+    v, u = row * 2 ** max(level - 1, 0), column * 2 ** max(level - 1, 0)
+    side = 2 ** (min(level + 1, MAX_LEVEL) - 1)
+    rows, columns = (slice(max(at // side - 1, 0) * side, (at // side + 2) * side) for at in (v, u))
+    some = depth[rows, columns]
+    return farthest, some[some > 0].min(initial=np.inf)
 
 
 def _around(image: NDArray, row: int, column: int) -> NDArray:
@@ -286,7 +291,8 @@ def _plainly_free_to(table: SensorTable, nearest: NDArray, config: Config) -> ND
     reach = REACH_SIGMA * table.sigma
     to_rows = np.append(np.arange(ROWS) / table.rows_per_metre - reach, config.max_range)
     row = _row(table, np.minimum(nearest, config.max_range))
-    later = np.array([to_rows[r + 1 :].min() for r in row])
+    least_from = np.minimum.accumulate(to_rows[::-1])[::-1]
+    later = least_from[row + 1]
     return np.where(np.isfinite(nearest), np.minimum(nearest - reach[row], later), np.inf)
 
 
@@ -320,11 +326,21 @@ def _row(table: SensorTable, d: NDArray | float) -> NDArray[np.int64]:
 
 def _strongest(indices: NDArray, evidence: NDArray) -> Cells:
     """Keep for each cell its largest positive evidence, or without any its most negative."""
-    cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
+    cells, of_cell = _distinct(indices)
     best, worst = np.zeros(len(cells)), np.zeros(len(cells))
-    np.maximum.at(best, of_cell.ravel(), evidence)
-    np.minimum.at(worst, of_cell.ravel(), evidence)
+    np.maximum.at(best, of_cell, evidence)
+    np.minimum.at(worst, of_cell, evidence)
     return _known(cells, np.where(best > 0, best, worst))
+
+
+def _distinct(indices: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct cells (N, 3) in ascending order, and for each index the number of its cell."""
+    if not len(indices):
+        return indices, np.empty(0, np.int64)
+    low = indices.min(axis=0)
+    box = indices.max(axis=0) - low + 1
+    numbers, of_cell = np.unique(np.ravel_multi_index(tuple((indices - low).T), tuple(box)), return_inverse=True)
+    return np.stack(np.unravel_index(numbers, tuple(box)), axis=1) + low, of_cell.ravel()
 
 
 def _known(cells: NDArray, evidence: NDArray) -> Cells:

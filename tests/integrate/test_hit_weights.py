@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weight of a hit: full if much of a cell's footprint supports it, less if only a few pixels do."""
 
+from dataclasses import replace
+
 import naive_integrators
 import numpy as np
 import pytest
@@ -18,12 +20,13 @@ STRAIGHT = PinholeCamera(64, 48, 40.0, 40.0, 32.0, 24.0, 0.05)
 
 
 def hits_of(image, integrator):
-    return {cell: value for cell, value in cells_of(integrator.evidence(image)).items() if value > 0}
+    evidence = integrator.evidence(image)
+    return cells_of(replace(evidence, values=np.maximum(evidence.values, 0), uniform_values=0))
 
 
 def reference_hits(image, config):
     table = naive_integrators._table(image, config, make_sensor(config.sensor))
-    cells = np.unique(naive_integrators._hit_cells(image, config), axis=0)
+    cells, _ = naive_integrators._distinct(naive_integrators._hit_cells(image, config))
     cells, evidence = naive_integrators._weighed(cells, image, config, table)
     thousandths = np.rint(1000 * evidence).astype(int).tolist()
     return dict(zip(map(tuple, cells.tolist()), thousandths, strict=True))

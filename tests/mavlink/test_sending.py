@@ -27,7 +27,7 @@ class Clock:
 
 @pytest.fixture(scope="module")
 def frames():
-    return list(open_source("sim:room", frames=":30:3"))
+    return list(open_source("sim:room?image_width=212", frames=":30:3"))
 
 
 @pytest.fixture
@@ -194,7 +194,7 @@ def test_where_directions_cannot_be_told_nothing_is(start_autopilot, mapped, mon
 def test_it_observes_a_run(start_autopilot, tmp_path):
     autopilot = start_autopilot()
     with (
-        MapRun("sim:room", tmp_path / "room.svox", frames=":20") as run,
+        MapRun("sim:room?image_width=160", tmp_path / "room.svox", frames=":20") as run,
         ObstacleSender(run.mapper, autopilot.url, rate_hz=100, max_age_s=60) as sender,
     ):
         run.finish([sender])

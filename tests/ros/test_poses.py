@@ -7,7 +7,8 @@ import wire
 
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.geometry.se3 import from_quaternion
-from stereovox.ros.poses.poses import MAX_TRANSFORMS, LiveTf, PoseBuffer, fixed_transform
+from stereovox.ros.poses import poses
+from stereovox.ros.poses.poses import LiveTf, PoseBuffer, fixed_transform
 
 MS = 1_000_000
 START = 10**12
@@ -106,14 +107,15 @@ def test_damaged_messages_are_counted_and_change_nothing(robot):
     assert robot.pose("camera", START).T_world_sensor[0, 3] == pytest.approx(0.5)
 
 
-def test_old_transforms_go_and_a_clock_that_is_set_back_starts_anew():
+def test_old_transforms_go_and_a_clock_that_is_set_back_starts_anew(monkeypatch):
+    monkeypatch.setattr(poses, "MAX_TRANSFORMS", 300)
     tree = LiveTf()
-    for k in range(5 * MAX_TRANSFORMS):
+    for k in range(5 * 300):
         tree.add("odom", "base", START + k * MS, (k, 0, 0, 0, 0, 0, 1))
     edge = tree._up("base")
-    assert edge.count <= MAX_TRANSFORMS
-    last = START + (5 * MAX_TRANSFORMS - 1) * MS
-    assert tree.lookup("odom", "base", last - 100 * MS)[0, 3] == pytest.approx(5 * MAX_TRANSFORMS - 101)
+    assert edge.count <= 300
+    last = START + (5 * 300 - 1) * MS
+    assert tree.lookup("odom", "base", last - 100 * MS)[0, 3] == pytest.approx(5 * 300 - 101)
     tree.add("odom", "base", START, (-5, 0, 0, 0, 0, 0, 1))
     assert tree.lookup("odom", "base", START)[0, 3] == -5
     with pytest.raises(FrameRefused):

@@ -10,7 +10,9 @@ from stereovox.simulate.simulation import SCENES, Simulation
 from stereovox.simulate.stage import Stage, rectangle
 
 SMALL = "image_width=106"
-SHORT = {"flight": "length=60", "aisle": "speed=1"}
+SHORT = {"flight": "length=60", "aisle": "speed=1", "town": "frames=40&blocks=3"}
+PART = {"flight": "&length=60", "town": "&blocks=2"}
+"""Of scenes that take long to build, what is enough for a few frames."""
 
 
 def short(scene: str) -> Simulation:
@@ -25,13 +27,14 @@ def hits(simulation: Simulation, i: int) -> np.ndarray:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_scene_opens_by_its_name(scene):
-    source = open_source(f"sim:{scene}?frames=3&{SMALL}")
-    assert (source.name, len(source)) == (f"sim:{scene}?frames=3&{SMALL}", 3)
-    frame, again = source.frame(1), open_source(f"sim:{scene}?frames=3&{SMALL}").frame(-2)
+    location = f"sim:{scene}?frames=3&{SMALL}{PART.get(scene, '')}"
+    source = open_source(location)
+    assert (source.name, len(source)) == (location, 3)
+    frame, again = source.frame(1), open_source(location).frame(-2)
     assert frame.depth.shape == (60, 106) == (frame.camera.height, frame.camera.width)
     assert (np.asarray(frame.depth, float) > 0).mean() > 0.5
     np.testing.assert_array_equal(frame.depth, again.depth)
-    assert not np.array_equal(frame.depth, open_source(f"sim:{scene}?frames=3&{SMALL}&seed=1").frame(1).depth)
+    assert not np.array_equal(frame.depth, open_source(f"{location}&seed=1").frame(1).depth)
     assert f"sim:{scene}" in Simulation.layout
 
 
@@ -56,7 +59,7 @@ def test_the_camera_moves_rigidly_and_through_nothing(scene):
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_optical_axes_change_the_frame_and_nothing_else(scene):
-    query = f"frames=5&{SMALL}"
+    query = f"frames=5&{SMALL}{PART.get(scene, '')}"
     world, optical = Simulation(f"sim:{scene}?{query}"), Simulation(f"sim:{scene}?{query}&axes=optical")
     np.testing.assert_allclose(optical.pose(0), np.eye(4), atol=1e-12)
     np.testing.assert_allclose(optical.pose(3), inverse(world.pose(0)) @ world.pose(3), atol=1e-12)

@@ -4,12 +4,20 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from made_loops import OFFICES, RING, bare_closer, closed, errors, mapped, off, truths
 
 from stereovox.config import load_config
 from stereovox.correct.loops.closer import Loop, LoopCloser
 from stereovox.correct.loops.matching import FLOOR, Match
+from stereovox.correct.loops.repeats import Repeats
 from stereovox.geometry.se3 import inverse, rotation_matrix
+
+
+@pytest.fixture
+def unrepeated(monkeypatch):
+    """From when it is called, nobody looks for what repeats, which takes longest: `test_repeats.py`."""
+    return lambda: monkeypatch.setattr(Repeats, "look", lambda *_: None)
 
 
 def test_a_ring_is_closed_and_the_way_becomes_right():
@@ -31,7 +39,8 @@ def test_offices_that_look_the_same_are_told_apart():
     assert off([submap.T_map_anchor for submap in closer.submaps], truth) < 0.5 * before
 
 
-def test_a_loop_that_the_poses_do_not_allow_is_refused_and_told():
+def test_a_loop_that_the_poses_do_not_allow_is_refused_and_told(unrepeated):
+    unrepeated()
     made = mapped(RING.replace("drift=0.02", "drift=0.08"))
     closer = LoopCloser(load_config(made.config, **{"loops.drift": 0.002, "loops.drift_deg": 0.02}))
     for frame in made.kept_frames.frames:
@@ -56,8 +65,9 @@ def test_frames_between_anchors_move_smoothly():
         np.testing.assert_allclose(new[key], T, atol=1e-9)
 
 
-def test_poses_that_are_known_badly_are_bent_more():
-    made = mapped(RING)
+def test_poses_that_are_known_badly_are_bent_more(unrepeated):
+    made, sure = mapped(RING), closed(RING)
+    unrepeated()
     frames = made.kept_frames.frames
     assert {frame.pose_sigma for frame in frames} == {(0.0, 0.0)}
     shaky, found = range(len(frames) // 3, len(frames) // 2), []
@@ -65,7 +75,7 @@ def test_poses_that_are_known_badly_are_bent_more():
     for n, frame in enumerate(frames):
         unsure.add(replace(frame, pose_sigma=(0.015, 0.3)) if n in shaky else frame)
     unsure.finish()
-    for closer in (closed(RING), unsure):
+    for closer in (sure, unsure):
         bends = [submap.bend[:3, 3] for submap in closer.submaps]
         stamps = [submap.stamp_ns for submap in closer.submaps]
         ends = np.searchsorted(stamps, [frames[shaky[0]].stamp_ns, frames[shaky[-1]].stamp_ns])
@@ -74,7 +84,8 @@ def test_poses_that_are_known_badly_are_bent_more():
     assert found[1] > 1.5 * found[0]
 
 
-def test_two_cameras_back_to_back_are_one_body():
+def test_two_cameras_back_to_back_are_one_body(unrepeated):
+    unrepeated()
     made, T_front_rear = mapped(RING, 0, 60), np.eye(4)
     T_front_rear[:3, :3], T_front_rear[:3, 3] = rotation_matrix([0, np.pi, 0]), [0.2, 0, -0.3]
     one, both = LoopCloser(made.config), LoopCloser(made.config)
@@ -89,7 +100,8 @@ def test_two_cameras_back_to_back_are_one_body():
     assert set(both.corrected()) == {(s, f.stamp_ns) for f in made.kept_frames.frames for s in (f.sensor, "rear")}
 
 
-def test_frames_may_come_in_any_order_of_time():
+def test_frames_may_come_in_any_order_of_time(unrepeated):
+    unrepeated()
     made = mapped(RING, 0, 60)
     closer = LoopCloser(made.config)
     for frame in made.kept_frames.frames:

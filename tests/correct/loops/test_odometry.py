@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from made_loops import ELSEWHERE, mapped, off, truths
+from made_loops import ELSEWHERE, blind, follow, off, truths
 
 from stereovox.config import load_config
 from stereovox.correct.loops.closer import LoopCloser
@@ -28,11 +28,9 @@ def wheels(length=230, jump=None):
 
 
 def closer(poses=None, **settings):
-    made = mapped(WALK, 0, 230)  # the ring is not closed
-    config = load_config(made.config, **{**WALK_DRIFT, **settings})
-    closer = LoopCloser(config, None if poses is None else Odometry(poses, config.loops))
-    for frame in made.kept_frames.frames:
-        closer.add(frame)
+    config = load_config(**{**WALK_DRIFT, **settings})
+    closer = blind(LoopCloser(config, None if poses is None else Odometry(poses, config.loops)))
+    follow(closer, WALK, 230)
     closer.finish()
     return closer
 
@@ -43,7 +41,6 @@ def off_by(closer):
 
 def test_a_way_that_drifts_is_held():
     alone, held = closer(), closer(wheels(), **{"loops.odometry_drift": 0.002, "loops.odometry_drift_deg": 0.02})
-    assert not alone.loops
     assert off_by(alone) > 0.15
     assert off_by(held) < 0.2 * off_by(alone)
     assert held._odometry.summary() == {"used": len(held.submaps) - 1, "contradicted": 0}

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from made_loops import ELSEWHERE, mapped, off, truths
+from made_loops import ELSEWHERE, blind, follow, off, truths
 
 from stereovox.config import load_config
 from stereovox.correct.close_loops import _positions
@@ -30,9 +30,8 @@ def measured(sigma, every_ns=1_000_000_000, length=None):
 
 @cache
 def unfinished():
-    closer = LoopCloser(mapped(WALK, 0, 230).config)
-    for frame in mapped(WALK, 0, 230).kept_frames.frames:  # the ring is not closed
-        closer.add(frame)
+    closer = blind(LoopCloser(load_config()))
+    follow(closer, WALK, 230)
     return closer
 
 
@@ -47,7 +46,6 @@ def test_a_way_that_drifts_is_held():
     truth = truths(closer, WALK)
     before = off([submap.T_odom_anchor for submap in closer.submaps], truth)
     after = off([submap.T_map_anchor for submap in closer.submaps], truth)
-    assert not closer.loops
     assert before > 0.15
     assert after < 0.5 * before
     np.testing.assert_allclose(closer.submaps[0].T_map_anchor, closer.submaps[0].T_odom_anchor, atol=1e-2)

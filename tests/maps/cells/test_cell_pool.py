@@ -48,26 +48,30 @@ class Slow:
                 self.blocks[block] = np.asarray(numbers)
 
 
+    def rows(self, coords):
+        return np.array([self.blocks[block] for block in coords]).reshape(-1, 512)
+
+
 def assert_same(pool, slow, rules):
     """Compare every cell in every way a pool is read, and that it keeps no more rows than it must."""
     coords, cells = (np.concatenate(part) for part in zip(*pool.pieces(), strict=True))
     wanted = sorted(slow.blocks)
     assert list(map(tuple, coords.tolist())) == wanted
-    assert cells.tolist() == [slow.blocks[block].tolist() for block in wanted]
+    np.testing.assert_array_equal(cells, slow.rows(wanted))
     at_floor = sum((numbers == rules.lowest).all() for numbers in slow.blocks.values())
     assert pool.count.tolist() == [len(wanted) - at_floor, at_floor]
     assert sorted(map(tuple, pool.block_coords.tolist())) == wanted
     around = np.argwhere(np.ones((6, 6, 6), bool)).astype(np.int32) - 3
     there, found = pool.get(around)
     assert [tuple(block) for block in there.tolist()] == [b for b in map(tuple, around.tolist()) if b in slow.blocks]
-    assert found.tolist() == [slow.blocks[tuple(block)].tolist() for block in there.tolist()]
+    np.testing.assert_array_equal(found, slow.rows(map(tuple, there.tolist())))
     asked = np.random.default_rng(0).integers(-24, 24, (500, 3))
     stored = stored_at(pool.stored_cells, (1.0, 1.0, 1.0), asked + 0.5)
     empty = np.full(512, slow.unknown)
     low = asked & 7
     assert stored.tolist() == [
-        slow.blocks.get(tuple(cell >> 3), empty)[(x << 6) | (y << 3) | z]
-        for cell, (x, y, z) in zip(asked, low, strict=True)
+        slow.blocks.get(block, empty)[(x << 6) | (y << 3) | z]
+        for block, (x, y, z) in zip(map(tuple, (asked >> 3).tolist()), low.tolist(), strict=True)
     ]
 
 

@@ -32,9 +32,9 @@ class Slow:
         evidence = moment.evidence
         values = [*evidence.values, *(np.full(512, value) for value in evidence.uniform_values)]
         for block, row in zip([*evidence.coords, *evidence.uniform], values, strict=True):
+            x, y, z = (block * 8).tolist()
             for c in np.flatnonzero(row).tolist():
-                cell = tuple((block * 8 + [c >> 6, (c >> 3) & 7, c & 7]).tolist())
-                self.stamps[cell] = moment.viewpoint.stamp_ns
+                self.stamps[x + (c >> 6), y + ((c >> 3) & 7), z + (c & 7)] = moment.viewpoint.stamp_ns
 
 
 def seen(one):

@@ -55,21 +55,23 @@ class Slow:
         for axis in range(3):
             while abs(position[axis] - self.middle[axis] * 0.1) > self.config.window.trigger + 1e-9:
                 self.middle[axis] += int(np.sign(position[axis] - self.middle[axis] * 0.1))
-        self.low = self.middle - self.n // 2
+        self.low = (self.middle - self.n // 2).tolist()
+        self.high = (self.middle - self.n // 2 + self.n).tolist()
         if self.config.window.outside == "drop":
             self.cells = {c: v for c, v in self.cells.items() if self.inside(c)}
 
     def inside(self, cell):
-        return bool(((np.array(cell) >= self.low) & (np.array(cell) < self.low + self.n)).all())
+        return all(low <= x < high for low, x, high in zip(self.low, cell, self.high, strict=True))
 
     def add(self, evidence):
         blocks = [(b, v) for b, v in zip(evidence.coords, evidence.values, strict=True)]
         blocks += [(b, np.full(512, v)) for b, v in zip(evidence.uniform, evidence.uniform_values, strict=True)]
         for block, values in blocks:
-            for c, value in enumerate(values):
-                cell = tuple(int(x) for x in block * 8 + [c >> 6, (c >> 3) & 7, c & 7])
+            x, y, z = (block * 8).tolist()
+            for c, value in enumerate(values.tolist()):
+                cell = x + (c >> 6), y + ((c >> 3) & 7), z + (c & 7)
                 if value and self.inside(cell):
-                    total = min(max(self.cells.get(cell, -2197) + int(value), -4000), 3500)  # prior 0.1
+                    total = min(max(self.cells.get(cell, -2197) + value, -4000), 3500)  # prior 0.1
                     self.cells[cell] = total or 1
 
 
@@ -90,10 +92,8 @@ def test_equals_a_dictionary(outside, uniform):
         slow.add(evidence)
         fast.add(evidence)
         indices, log_odds = fast.cells()
-        found = {
-            tuple(map(int, cell)): round(float(value) * 1000) for cell, value in zip(indices, log_odds, strict=True)
-        }
-        assert found == slow.cells
+        thousandths = np.rint(log_odds.astype(float) * 1000).astype(int)
+        assert dict(zip(map(tuple, indices.tolist()), thousandths.tolist(), strict=True)) == slow.cells
         here = {tuple(x // 8 for x in cell) for cell in slow.cells if slow.inside(cell)}
         assert outside == "keep" or {tuple(block) for block in fast.storage.blocks()[0].tolist()} == here
     assert len(slow.cells) > 1000

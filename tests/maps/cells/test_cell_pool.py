@@ -47,7 +47,6 @@ class Slow:
             if (numbers != self.unknown).any():
                 self.blocks[block] = np.asarray(numbers)
 
-
     def rows(self, coords):
         return np.array([self.blocks[block] for block in coords]).reshape(-1, 512)
 

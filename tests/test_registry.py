@@ -3,6 +3,7 @@
 
 import os
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -38,3 +39,12 @@ def test_the_order_of_installed_files_changes_no_list(tmp_path, monkeypatch, ord
     others = [name for name in cli.commands() if name not in cli.COMMANDS]
     assert others == sorted(others)
     assert "own" in others
+
+
+def test_a_layout_that_has_the_name_of_one_of_ours_is_asked_first_and_ours_stays(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "other-1.dist-info").mkdir()
+    (tmp_path / "other-1.dist-info/METADATA").write_text("Name: other\nVersion: 1\n")
+    (tmp_path / "other-1.dist-info/entry_points.txt").write_text("[stereovox.sources]\nplain = pathlib:Path\n")
+    os.utime(tmp_path, ns=(3, 3))
+    assert list(registry.every("sources", {"tum": "os:PathLike", "plain": "os:stat"})) == [Path, os.PathLike, os.stat]

@@ -204,8 +204,7 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
     Raises SourceError if there is nothing, nothing known or nothing usable.
     """
     place = os.fspath(where)
-    for name in registry.names("robots", ROBOTS):
-        kind = registry.find("robots", ROBOTS, name)
+    for kind in registry.every("robots", ROBOTS):
         if kind.recognises(place):
             return kind(place)
     if place.startswith("sim:"):
@@ -217,8 +216,7 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
 
 def is_robot(path: str | os.PathLike[str]) -> bool:
     """Return whether `open_robot` recognises `path`, by its name or content."""
-    kinds = (registry.find("robots", ROBOTS, name) for name in registry.names("robots", ROBOTS))
-    return any(kind.recognises(os.fspath(path)) for kind in kinds)
+    return any(kind.recognises(os.fspath(path)) for kind in registry.every("robots", ROBOTS))
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
@@ -253,12 +251,12 @@ def _image_classes() -> tuple[Any, ...]:
 
 def _classes() -> Iterator[Any]:
     """Yield the classes of recordings one by one, so that only those needed are imported."""
-    return (kind_of(registry.find("sources", SOURCES, name)) for name in registry.names("sources", SOURCES))
+    return map(kind_of, registry.every("sources", SOURCES))
 
 
 def _live_class(where: str) -> Any:
     """Return the class of the live camera that `where` names, None if it names none."""
-    kinds = (kind_of(registry.find("streams", STREAMS, name)) for name in registry.names("streams", STREAMS))
+    kinds = map(kind_of, registry.every("streams", STREAMS))
     return next((kind for kind in kinds if kind.recognises(where)), None)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from importlib import import_module, metadata
 from typing import Any
@@ -37,8 +37,7 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
     Raises ConfigError that suggests or lists the known names.
     """
     if name in builtin:
-        module, _, attribute = builtin[name].partition(":")
-        return getattr(import_module(module), attribute)
+        return _load(builtin[name])
     others = {entry.name: entry for entry in entry_points(group=f"stereovox.{room}")}
     if name in others:
         return others[name].load()
@@ -46,5 +45,17 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
 
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:
-    """Return all names registered in `room`, other packages' first: their layouts are tried before ours."""
+    """Return all names registered in `room`, other packages' first."""
     return list(dict.fromkeys([*sorted(entry.name for entry in entry_points(group=f"stereovox.{room}")), *builtin]))
+
+
+def every(room: str, builtin: Mapping[str, str]) -> Iterator[Any]:
+    """Yield all objects registered in `room`, other packages' first, whatever their names; each is imported then."""
+    for entry in sorted(entry_points(group=f"stereovox.{room}"), key=lambda entry: entry.name):
+        yield entry.load()
+    yield from map(_load, builtin.values())
+
+
+def _load(place: str) -> Any:
+    module, _, attribute = place.partition(":")
+    return getattr(import_module(module), attribute)

@@ -89,6 +89,17 @@ def test_a_merged_map_goes_on_and_is_corrected_as_one_run(tmp_path):
     assert equal(mapper.map, mapped(every))
 
 
+def test_a_guess_of_what_is_up_keeps_no_maps_apart(tmp_path):
+    """Two recordings of one place were guessed to lean differently: heights and pictures follow it, cells do not."""
+    every = frames()
+    for name, some, lean in (("a", every[:7], 0.05), ("b", every[7:], -0.12)):
+        mapped(some, up_direction=[lean, 0, (1 - lean**2) ** 0.5]).save(tmp_path / name)
+    a, b = sv.load_map(tmp_path / "a"), sv.load_map(tmp_path / "b")
+    assert why_added(a, b) is None
+    assert equal(sv.merge(a, b), mapped(every))
+    assert sv.merge(a, b).config.up_direction == a.config.up_direction
+
+
 def test_worlds_that_differ_are_joined_by_their_transform():
     every = frames()
     T_a_b = np.eye(4)

@@ -29,7 +29,7 @@ from stereovox.products.merge import merge as added
 from stereovox.products.merge import together
 from stereovox.products.moved import rigid
 
-OF_WORLD = {"up", "up_direction", "levelled_from"}
+OF_WORLD = {"up", "levelled_from"}
 """Settings that may differ if a transform between the worlds is given."""
 
 

@@ -14,7 +14,7 @@ POSES = {
     "t265": "stereovox.sources.poses.pose_stream:T265",
     "mavlink": "stereovox.mavlink.stream:MavlinkPoses",
 }
-"""Streams of poses (`PoseStream`), tried in this order, then entry points in the group `stereovox.poses`."""
+"""Streams of poses (`PoseStream`), tried in this order after entry points in the group `stereovox.poses`."""
 
 
 def open_poses(where: str) -> PoseStream:
@@ -23,8 +23,7 @@ def open_poses(where: str) -> PoseStream:
     Raises:
         SourceError: It names no stream, or one that cannot be used.
     """
-    for name in registry.names("poses", POSES):
-        kind = registry.find("poses", POSES, name)
+    for kind in registry.every("poses", POSES):
         if kind.recognises(where):
             return kind(where)
     words = f"{TRACK}, {GIVEN}, t265, udp://:5005, tcp://HOST:5005 or mavlink:udpin:0.0.0.0:14540"

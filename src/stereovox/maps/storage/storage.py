@@ -33,7 +33,7 @@ from stereovox.maps.storage.tiles import TileStore
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block allowed in `Storage.blocks_within`, and the first beyond the highest."""
 
-NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms", "amcl", "slam", "loops"}
+NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms", "amcl", "slam", "loops", "up_direction"}
 """Settings that do not change the evidence of past frames; `map` is compared separately."""
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]

@@ -101,7 +101,7 @@ class Scene:
 
 def px(pixels: float, distance: float = 4.0, width: int = 320, **other: object) -> Scene:
     """Return a scene with a pole `pixels` wide."""
-    scene = Scene(0.01, distance=distance, width=width, **other)  # pyright: ignore[reportArgumentType]
+    scene = Scene(0.01, distance=distance, width=width, **other)
     return replace(scene, pole=pixels * distance / scene.camera.fx)
 
 

@@ -119,7 +119,7 @@ def save(figure: plt.Figure, name: str) -> None:
     """Write one picture next to this file."""
     engine = figure.get_layout_engine()
     if engine is not None:
-        engine.set(w_pad=0.2, h_pad=0.2)  # pyright: ignore[reportCallIssue] - inches of free paper about it
+        engine.set(w_pad=0.2, h_pad=0.2)  # inches of free paper about it
     figure.savefig(HERE / name, facecolor=PAPER, metadata={"Date": None})
     plt.close(figure)
 

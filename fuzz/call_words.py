@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from stereovox.cli import _Parser, command_module, commands  # pyright: ignore[reportPrivateUsage]
+from stereovox.cli import _Parser, command_module, commands
 
 Draw = Callable[[str], str]
 WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "export": 3}

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = {
     "lint": ["ruff", "check", "--no-cache"],
     "format": ["ruff", "format", "--no-cache", "--check"],
-    "types": ["basedpyright", "--pythonpath", sys.executable],
+    "types": ["pyrefly", "check", "--python-interpreter-path", sys.executable],
 }
 
 MOST = {

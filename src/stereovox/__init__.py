@@ -202,7 +202,7 @@ _HOMES = {
     "open_viewer": "viewer.viewer",
     "LiveView": "viewer.live",
 }
-__all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = [*_HOMES, "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,7 @@ SCALE = 5000
 @cache
 def room(count: int) -> tuple[Frame, ...]:
     """The first frames, with their true poses."""
-    return tuple(open_source(ROOM, f":{count}"))  # pyright: ignore[reportReturnType] - depth images
+    return tuple(open_source(ROOM, f":{count}"))  # depth images
 
 
 def unposed(folder: Path, count: int = 10, covered: Collection[int] = (), poses: bool = False) -> Path:

@@ -263,6 +263,6 @@ def test_rectangles_face_the_way_they_should():
         for sign in (1.0, -1.0):
             towards = tuple(sign if k == axis else 0.0 for k in range(3))
             high = tuple(0.0 if k == axis else 2.0 + k for k in range(3))
-            face = rectangle("side", (0, 0, 0), high, towards)  # pyright: ignore[reportArgumentType]
+            face = rectangle("side", (0, 0, 0), high, towards)
             np.testing.assert_allclose(face.normal, towards, atol=1e-12)
             assert len(np.unique(face.corners, axis=0)) == 4

@@ -100,9 +100,7 @@ class _Parser(argparse.ArgumentParser):
         self.options += [name.removeprefix("--") for name in names if name.startswith("--")]
         return super().add_argument(*names, **settings)
 
-    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has many signatures
-        self, args: Any = None, namespace: Any = None
-    ) -> Any:
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self._words = args or ()
         return super().parse_known_args(args, namespace)
 

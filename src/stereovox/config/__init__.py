@@ -92,7 +92,7 @@ class Config(Section):
     device: Literal["cpu", "cuda"] = "cpu"
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
     deadline_ms: float | None = Field(None, gt=0)
-    max_memory: ByteSize | None = Field(None, gt=0, le=10**12)
+    max_memory: ByteSize | None = Field(None, gt=0, le=10**12)  # pyrefly: ignore[bad-argument-type] - whole bytes
     when_full: Literal["refuse", "roll", "spill"] = "refuse"
     trust: TrustConfig = Field(default_factory=lambda: TrustConfig.model_validate({}))
     pace: PaceConfig = Field(default_factory=lambda: PaceConfig.model_validate({}))

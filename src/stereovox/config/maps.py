@@ -98,7 +98,7 @@ class MapConfig(Section):
     keep_times: bool = False
     forget_s: float | None = Field(None, gt=0)
     keep_frames: bool = False
-    frames_budget: ByteSize | None = Field(None, gt=0, le=10**13)
+    frames_budget: ByteSize | None = Field(None, gt=0, le=10**13)  # pyrefly: ignore[bad-argument-type] - whole bytes
 
     @model_validator(mode="after")
     def _ordered(self) -> MapConfig:

@@ -201,7 +201,7 @@ class _Driven(NamedTuple):
     way: float
 
 
-def _key(frame: KeptFrame) -> tuple[str, int]:
+def _key(frame: KeptFrame) -> FrameKey:
     return frame.sensor, frame.stamp_ns
 
 

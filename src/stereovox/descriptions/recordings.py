@@ -58,7 +58,7 @@ def _recording(path: str) -> Description:
 def _images(path: str) -> Description | None:
     """Describe depth images without poses, or None."""
     try:
-        found = survey(open_images(path))  # pyright: ignore[reportArgumentType] - it can be read in any order
+        found = survey(open_images(path))  # pyrefly: ignore[bad-argument-type] - it can be read in any order
     except StereovoxError:
         return None
     missing, why, commands = _missing(path)

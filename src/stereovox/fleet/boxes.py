@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,10 +154,10 @@ def saved(done: DoneBox) -> list[object]:
     return [None if done.entry is None else done.entry.saved(), done.seconds]
 
 
-def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
+def loaded(values: list[Any], layout: BoxLayout) -> DoneBox:
     """Return a saved box. Raises KeyError, TypeError or ValueError for invalid values."""
     entry, seconds = values
-    return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))  # pyright: ignore[reportArgumentType]
+    return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))
 
 
 def _done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:

@@ -59,7 +59,7 @@ class Cluster:
                 f"the workers that had '{name}' died {LOST_WORKERS} times (too little memory?); finished work "
                 "is kept, continue with --resume"
             ) from None
-        except (OSError, TimeoutError) as error:
+        except OSError as error:
             raise StereovoxError(
                 f"the cluster is lost ({error}); finished work is kept, continue with --resume"
             ) from None
@@ -101,7 +101,7 @@ def cluster(
         if scheduler is not None:
             try:
                 client = Client(scheduler, timeout=PATIENCE_S)
-            except (OSError, ValueError, TimeoutError) as error:
+            except (OSError, ValueError) as error:
                 raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
             with client:
                 _check_workers(client, scheduler, notify)

@@ -265,7 +265,7 @@ def _known_layout(place: Place) -> BoxLayout | None:
     try:
         values = None if known is None else unsealed(known)
         return None if values is None else BoxLayout(load_config(values["config"]), values["side"])
-    except (KeyError, TypeError, ValueError, StereovoxError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); choose another name for the map") from None
 
 

@@ -193,7 +193,8 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
     """Return the report of a recording that was already indexed, else None."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
     try:
-        return None if saved is None else RecordingReport(**{**unsealed(saved), "seconds": 0.0})
+        values: dict[str, Any] | None = None if saved is None else {**unsealed(saved), "seconds": 0.0}
+        return None if values is None else RecordingReport(**values)
     except (TypeError, ValueError):
         return None  # it is mapped again
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
+from stereovox.errors import FrameRefused, MapFileError, SourceError, StereovoxError
 from stereovox.formats.clouds import PointFile, map_of_cloud
 from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_of_nodes
 from stereovox.kernels.threads import one_state
@@ -130,7 +130,7 @@ def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Map
         return readers[bag.types[topic]](bag.read(topic, len(bag.stamps(topic)) - 1))
     except (SourceError, FrameRefused) as error:
         raise MapFileError(str(error)) from None
-    except (ValueError, ConfigError) as error:
+    except ValueError as error:
         raise MapFileError(f"{path}: {error}") from None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.errors import ConfigError, MapFileError
+from stereovox.errors import MapFileError
 from stereovox.files.safe_io import read_bounded, replacing
 from stereovox.formats import _octree
 from stereovox.kernels.threads import one_state
@@ -64,7 +64,7 @@ def read_octomap(path: str | Path) -> VoxelMap:
     try:
         title, header, body = _split(content)
         made = map_of_nodes(title, body, _voxel_size(header), _size(header), _tree(header.get("id", "")))
-    except (ValueError, ConfigError) as error:
+    except ValueError as error:
         raise MapFileError(f"{path}: not a whole OctoMap file: {error}; export it again") from None
     made.history.imported = Imported(Path(path).name, f"OctoMap, {_size(header):,} nodes")
     return made

@@ -164,7 +164,7 @@ def _rerun() -> ModuleType:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            import rerun  # pyright: ignore[reportMissingImports]
+            import rerun
     except ImportError:
         raise MissingExtra("rerun-sdk", "rerun") from None
     return rerun

@@ -61,7 +61,7 @@ def on_gpu(cell: Function) -> Function:
 
 def launch(kernel: Function, *arguments: Any) -> None:
     """Run a kernel on the card; it has finished before anything is copied back."""
-    kernel[_blocks(), THREADS](*arguments)  # pyright: ignore[reportIndexIssue]
+    kernel[_blocks(), THREADS](*arguments)
 
 
 def to_gpu(array: Any) -> Any:

@@ -174,7 +174,7 @@ class Newest:
                 self._job()
 
 
-class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stub calls it final
+class MapLock(RLock):  # pyrefly: ignore[invalid-inheritance] - only its stub calls it final
     """A re-entrant lock that can be copied and pickled; the copy is a new lock, not held by any thread."""
 
     def refuse_holder(self, what: str = "a frame cannot be added") -> None:
@@ -182,7 +182,7 @@ class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stu
 
         what: start of the error message.
         """
-        if self._is_owned():  # pyright: ignore[reportAttributeAccessIssue] - threading.Condition uses it too
+        if self._is_owned():  # pyrefly: ignore[missing-attribute] - threading.Condition uses it too
             raise StereovoxError(
                 f"{what} by a thread that holds the map's lock, as a listener does; do so once it is released"
             )

@@ -187,10 +187,10 @@ class NearDepth:
         return shortened(image, self._near, self._far_from(image.camera))
 
 
-def _far_from(config: Config, near: float, camera: object) -> float:
+def _far_from(config: Config, near: float, camera: VirtualCamera) -> float:
     """Return the measured depth beyond which everything up to `near` is certainly free, whatever the noise."""
     reach = near if isinstance(camera, PinholeCamera) else FACE * near
-    return reach + REACH_SIGMA * float(RangeNoise.of(config.noise, camera).sigma(reach))  # pyright: ignore[reportArgumentType]
+    return reach + REACH_SIGMA * float(RangeNoise.of(config.noise, camera).sigma(reach))
 
 
 class Scheduler:

@@ -131,7 +131,7 @@ class Plane:
         starts, rays = np.asarray(origins, float), np.asarray(directions, float)
         far = max_distance / np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
         lines = np.column_stack([self._cells(starts), self._cells(starts + rays * far[:, None])])
-        return RayHits.none(len(rays))._replace(distance=self._storage.cast(lines) * max_distance)
+        return RayHits.none(len(rays))._replace(distance=(self._storage.cast(lines) * max_distance).astype(np.float32))
 
     def share(self, T: Transform, points: NDArray[np.float64]) -> float:
         """Return the share of points (N, 3) in the sensor's frame that are near a surface if the sensor is at T."""

@@ -44,7 +44,7 @@ class BoxedMap(VoxelMap):
     refused with the cure. `counts` and `bounds` read nothing. Nothing can be added to it.
     """
 
-    storage: BoxedStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
+    storage: BoxedStorage  # pyrefly: ignore[bad-override-mutable-attribute] - set once
 
     def __init__(self, place: Place, manifest: BoxedManifest, cache_bytes: int = CACHE_BYTES):
         super().__init__(manifest.layout.config, storage=BoxedStorage(place, manifest, cache_bytes))

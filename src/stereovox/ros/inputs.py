@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -234,7 +234,7 @@ def _no_scan(topic: str, error: Exception) -> Scan:
     return replace(blank, **_fault(error, topic))
 
 
-def _fault(error: Exception, name: str) -> dict[str, str]:
+def _fault(error: Exception, name: str) -> dict[str, Any]:
     if isinstance(error, FrameRefused):
         return {"fault": error.reason, "fault_detail": str(error)}
     return {"fault": "unreadable", "fault_detail": f"{name}: {error}; the message is damaged"}

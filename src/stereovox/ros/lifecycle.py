@@ -68,7 +68,8 @@ class Managed(Run[None, dict[str, Any]]):
         self._node, self._begin_run = node, begin
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._entities, self._run = Entities(node), None
+        self._entities = Entities(node)
+        self._run: NodeRun | None = None
         self._over, self._ended, self._report = False, False, dict[str, Any]()
         node.managed = self
 
@@ -105,14 +106,14 @@ class Managed(Run[None, dict[str, Any]]):
             self._node.get_logger().error("not configured: the last map is still being saved; configure again later")
             return False
         try:
-            self._run = self._begin_run(self._entities)
+            self._run = run = self._begin_run(self._entities)
         except Exception as error:  # rclpy would swallow it
             self._entities.destroy()
             self._executor.add_node(self._node)
             why = str(error) if isinstance(error, StereovoxError) else repr(error)
             self._node.get_logger().error(f"not configured: {why}")
             return False
-        self._run.map_node.active = False
+        run.map_node.active = False
         return True
 
     def activate(self, active: bool) -> None:

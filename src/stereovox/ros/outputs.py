@@ -90,7 +90,7 @@ def octomap_message(voxel_map: VoxelMap, full: bool, stamp_ns: int, frame_id: st
 
     Raises MapFileError for cells that an octree cannot hold.
     """
-    from octomap_msgs.msg import Octomap  # pyright: ignore[reportMissingImports] - it is not on PyPI
+    from octomap_msgs.msg import Octomap
 
     tree = (full_tree if full else binary_tree)(in_cubes(voxel_map))
     return Octomap(

@@ -53,7 +53,8 @@ class Score:
         self._clock, self._message = clock, Float32
         self._publisher = node.create_publisher(Float32, TOPIC, 10)
         self._work: Background[CellErrors] = Background("stereovox-score")
-        self._next, self._frames, self._last, self._busy = 0.0, 0, None, False
+        self._next, self._frames, self._busy = 0.0, 0, False
+        self._last: CellErrors | None = None
 
     def counts(self) -> dict[str, object]:
         """Return the values for diagnostics."""
@@ -88,11 +89,11 @@ class Score:
 
     def _take(self, score: Callable[[], CellErrors]) -> None:
         try:
-            self._last = score()
+            self._last = last = score()
         except StereovoxError as error:
             self._node.get_logger().warning(f"no score: {error}", throttle_duration_sec=30.0)
             return
-        self._publisher.publish(self._message(data=float(self._last.eq7_percent)))
+        self._publisher.publish(self._message(data=float(last.eq7_percent)))
 
     @staticmethod
     def _values(errors: CellErrors) -> dict[str, object]:

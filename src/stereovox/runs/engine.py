@@ -96,7 +96,7 @@ def takes(*kinds: Callable[..., Any]) -> Callable[[AnyCallable], AnyCallable]:
         *first, rest = own.parameters.values()
         passed = [one for kind in kinds for one in signature(kind).parameters.values() if one.kind == one.KEYWORD_ONLY]
         passed = [one for one in passed if one.name != "settings"]
-        function.__signature__ = own.replace(parameters=[*first, *passed, rest])  # pyright: ignore[reportFunctionMemberAccess]
+        function.__signature__ = own.replace(parameters=[*first, *passed, rest])  # pyrefly: ignore[missing-attribute]
         return function
 
     return shown

@@ -186,7 +186,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         super().__init__(self._options.notify)
         self.out, self._source = Path(out), source
         self._settings = self._options.settings
-        self._closing = no_progress
+        self._closing: Progress = no_progress
         self._tracker: Tracker | GuidedTracker | None = None
         if self._options.close_loops:
             refuse_without_frames(self._settings)
@@ -308,7 +308,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         named = isinstance(self._source, str | Path) and isinstance(source, Source)  # a live camera cannot be surveyed
         if not named or (profile is not None and not level):
             return {}, []
-        found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
+        found = survey(source, SURVEYED)
         if self.poses == TRACK:
             found = replace(found, up=None)  # it would be up by the recording's own poses
         settings = found.settings if profile is None else found.up_settings
@@ -324,7 +324,7 @@ class MapRun(MapperRun[AnyFrame, MapResult[VoxelMap]]):
         """
         if not self._options.level:
             return None
-        chosen = {**settings, **self._profile_up(), **self._settings}
+        chosen: dict[str, Any] = {**settings, **self._profile_up(), **self._settings}
         if "up" not in chosen:
             raise StereovoxError("level: the up direction of this recording is uncertain; give it: --set up=AXIS")
         if chosen.get("up_direction") is None:

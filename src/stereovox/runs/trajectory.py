@@ -208,7 +208,7 @@ class _TrackRun(Run[tuple[AnyFrame, Tracked], CameraTrack]):
         profile, given, stream = self._options.profile, self._options.settings, self._stream
         if profile is not None or not isinstance(stream, Source):
             return load_config("default" if profile is None else profile, **given), []
-        found = replace(survey(stream, SURVEYED), up=None)  # pyright: ignore[reportArgumentType] - it has frame(i)
+        found = replace(survey(stream, SURVEYED), up=None)
         chosen, lines = found.settings(given)
         return load_config("default", **{**given, **chosen}), lines
 

@@ -108,10 +108,10 @@ def tabulate(
     log_odds[:, 0], log_odds[:, -1] = _log_odds(model, np.array(model.p_free)), 0
     at = model.probability(z_measured, z_measured, sigma)
     width = sigma if pose_noise is None else np.hypot(sigma, pose_noise.sigma(z_measured))
-    hit = _log_odds(model, model.hit(z_measured, width, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
+    hit = _log_odds(model, model.hit(z_measured, width, voxel_size) if hasattr(model, "hit") else at)
     passed = log_odds[:, 0].copy()
     if hasattr(model, "passed"):
-        least = _log_odds(model, model.passed(z_measured, width, voxel_size))  # pyright: ignore
+        least = _log_odds(model, model.passed(z_measured, width, voxel_size))
         passed = np.clip(least, passed, 0)
     return SensorTable(log_odds, hit, passed, sigma, ROWS / max_range)
 

@@ -73,7 +73,7 @@ class Surround(Source):
     def __len__(self) -> int:
         return self.options.moments * len(self.pairs)
 
-    def frame(self, i: int) -> StereoFrame:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def frame(self, i: int) -> StereoFrame:
         """Return stereo frame `i` (negative: from the end); raises IndexError for a frame that does not exist."""
         pair, T_world_left, stamp_ns, name = self._at(i)
         assert pair.eyes is not None

@@ -219,7 +219,7 @@ class Source(Stream):
         Raises:
             SourceError: As for the class itself.
         """
-        return cls(where)  # pyright: ignore[reportCallIssue] - registered classes are constructed from `where`
+        return cls(where)  # pyrefly: ignore[bad-argument-count] - registered classes are constructed from `where`
 
 
 class DepthSource(Source):

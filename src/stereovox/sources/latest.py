@@ -71,7 +71,8 @@ class _Queue(Generic[T]):
 
     def __init__(self, capacity: int):
         self._capacity, self._waiting = capacity, deque[T]()
-        self._change, self._ended, self._error = Condition(), False, None
+        self._change, self._ended = Condition(), False
+        self._error: Exception | None = None
         self.stopped = Event()
 
     def put(self, item: T) -> int:

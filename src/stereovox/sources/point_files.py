@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import ConfigError, MapFileError
+from stereovox.errors import MapFileError
 from stereovox.files.safe_io import read_bounded, shown
 from stereovox.sources._lzf import unpack
 
@@ -68,7 +68,7 @@ def read_points(path: str | Path) -> Points:
         return Points(xyz, size, ply, head.faces, *(head.shape or (len(xyz), 1)), head.turned)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
-    except (ValueError, ConfigError) as error:
+    except ValueError as error:
         raise MapFileError(f"{path}: no readable points: {error}") from None
 
 

@@ -45,8 +45,8 @@ class GuidedTracker:
         own = _own_pose(frame)
         if own is None and self._T_world_tracker is None:
             return Tracked(self._at, np.full((6, 6), np.inf), NO_START)
-        known = own is not None and self._own is not None
-        tracked = self._tracker.add(frame, inverse(self._own) @ own if known else None)  # pyright: ignore
+        known = None if own is None or self._own is None else inverse(self._own) @ own
+        tracked = self._tracker.add(frame, known)
         if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image was unusable
             self._at, self._own = tracked.T_world_sensor, own
             if own is None and self._T_world_tracker is not None and not tracked.lost:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from stereovox.sources.base import Stream, closing
 from stereovox.track.fit import LOST, deviations
 from stereovox.track.tracker import POSE_FAULTS, Tracked
 
+FrameT = TypeVar("FrameT", bound=AnyFrame)
 CURE = "move slower, or back to what was seen before"
 
 
@@ -104,7 +105,7 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
             yield _begun(*waiting, why=waiting[1].lost)
 
 
-def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
+def posed(frame: FrameT, tracked: Tracked) -> FrameT:
     """Return a frame with the pose that was tracked, or with the fault `tracking_lost`; unchanged if faulty."""
     if _is_faulty(frame):
         return frame

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from stereovox.config import Config, WindowConfig
 from stereovox.errors import StereovoxError
 from stereovox.kernels.threads import Newest
-from stereovox.mapper import Mapper
+from stereovox.mapper import Mapper, UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.viewer.frame import FramePanel, describe_frame
@@ -37,7 +37,8 @@ class Replay:
         if not len(source):
             raise StereovoxError(f"{source.name}: holds no frames to replay")
         self._viewer, self._source, self._config = viewer, source, _as_shown(config)
-        self._mapper, self._done, self._report = Mapper(self._config), 0, None
+        self._mapper, self._done = Mapper(self._config), 0
+        self._report: UpdateReport | None = None
         self._kept: dict[int, VoxelMap] = {}
         self.draw = Newest(self._draw)
         gui = viewer.server.gui

@@ -283,7 +283,8 @@ class Trial:
     """One hall, mapped on a first round; faults and changes start from that map. settings: of the mapper."""
 
     def __init__(self, seed: int, cloud: bool = False, **settings: Any):
-        self.walk, self.settings = Walk(seed, cloud), {"voxel_size": 0.1, "max_range": 5.0, **settings}
+        self.walk = Walk(seed, cloud)
+        self.settings: dict[str, Any] = {"voxel_size": 0.1, "max_range": 5.0, **settings}
         self._hall = _always(self.walk.stage.build())
         mapper = Mapper(**self.settings)
         refused = [mapper.add(frame).refused for frame in self.walk.frames(0, LAP_S, MAP_HZ, self._hall)]

@@ -152,7 +152,7 @@ def test_a_lidar_is_the_truth_where_there_is_one(tmp_path, monkeypatch):
     made_street.sharpen(monkeypatch)
     drive = str(made_street.raw(tmp_path, 3))
     (task,) = tasks_of(drive, 0.5, 20.0)
-    wanted, _ = lidar_truth(sv.open_source(drive), 0.5, 20.0, "rays")  # pyright: ignore[reportArgumentType]
+    wanted, _ = lidar_truth(sv.open_source(drive), 0.5, 20.0, "rays")
     assert (task.kind, task.held_out, len(task.frames)) == (LIDAR, 0, 3)
     cells, log_odds = wanted.cells()
     assert np.array_equal(indices(task.truth.cells), cells)

@@ -44,5 +44,5 @@ def test_only_a_simulated_robot_is_written(tmp_path):
         name = "aces.clf"
 
     with pytest.raises(SourceError, match=r"aces\.clf: .* sim:floor"):
-        write_bag(Other(), tmp_path / "a.bag")  # pyright: ignore[reportArgumentType]
+        write_bag(Other(), tmp_path / "a.bag")
     assert not list(tmp_path.iterdir())

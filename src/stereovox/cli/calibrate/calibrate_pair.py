@@ -135,13 +135,14 @@ def _write(arguments: Namespace, folder: Path, settings: PairSettings, found: Pa
         say(f"nothing is written; keep it with: {command_line('calibrate', 'pair', folder, '--out', folder / FILE)}")
         return
     out = Path(arguments.out)
-    paths = {key: os.path.relpath(folder / getattr(settings, key), out.parent) for key in ("depth", "poses")}
-    result = {"T_tracker_camera": found.T_tracker_camera, "clock_offset_s": found.clock_offset_s}
+    depth, poses = (os.path.relpath(folder / path, out.parent) for path in (settings.depth, settings.poses))
+    T, offset_s = found.T_tracker_camera, found.clock_offset_s
+    found_settings = replace(settings, depth=depth, poses=poses, T_tracker_camera=T, clock_offset_s=offset_s)
     remarks = (
         f"T_tracker_camera and clock_offset_s: stereovox calibrate pair, {found.pairs} of {found.images} images",
         f"standard deviations: {1000 * found.offset_std_s:.2g} ms, {found.rotation_std_deg.max():.2g} deg, "
         f"{1000 * found.translation_std_m.max():.2g} mm",
     )
     with replacing(out) as file:
-        file.write(pair_text(replace(settings, **paths, **result), remarks).encode())
+        file.write(pair_text(found_settings, remarks).encode())
     say(f"saved {out}")

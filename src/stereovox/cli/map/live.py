@@ -116,8 +116,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
             from stereovox.cli.look.view import silence_server_log
 
             silence_server_log()
-        outputs = {name: getattr(arguments, name) for name in OUTPUTS if hasattr(arguments, name)}
-        live.add_outputs(**{**outputs, "heights": heights_of(arguments.heights), "rules": rules})
+        outputs: dict[str, Any] = {name: getattr(arguments, name) for name in OUTPUTS if hasattr(arguments, name)}
+        outputs |= {"heights": heights_of(arguments.heights), "rules": rules}
+        live.add_outputs(**outputs)
         if live.page:
             say(f"open {live.page} in a browser to see the map grow")
         say("mapping; Ctrl-C ends")

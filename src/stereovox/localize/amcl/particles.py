@@ -109,9 +109,10 @@ def draw(
     few, many = config.particles_min, config.particles_max
     count = few
     while True:
-        foreign = round(strangers * count) if weights_strangers is not None else 0
+        foreign, taken = 0, np.empty(0, np.int64)
+        if weights_strangers is not None and (foreign := round(strangers * count)):
+            taken = low_variance(weights_strangers, foreign, offset)
         kept = low_variance(weights, count - foreign, offset)
-        taken = low_variance(weights_strangers, foreign, offset) if foreign else np.empty(0, np.int64)  # pyright: ignore
         hit = np.zeros(int(bins.max()) + 1, bool)
         hit[bins[kept]] = True
         hit[bins[len(weights) + taken]] = True

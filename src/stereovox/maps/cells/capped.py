@@ -60,7 +60,7 @@ class CappedStorage(Storage):
 class CappedMap(VoxelMap):
     """A map without spatial bounds within `max_memory`; see `CappedStorage`. Raises ConfigError as that does."""
 
-    storage: CappedStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
+    storage: CappedStorage  # pyrefly: ignore[bad-override-mutable-attribute] - set once
 
     def __init__(self, config: Config):
         super().__init__(config, storage=CappedStorage(config))

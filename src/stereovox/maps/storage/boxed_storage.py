@@ -270,9 +270,9 @@ class BoxedStorage(Storage):
     def _as_mine(self, entry: BoxEntry, blocks: BoxBlocks) -> BoxBlocks:
         """Return the blocks of a box with values clamped to the cells' limits, and times rebased to this map's."""
         cells = np.clip(blocks.cells, self.rules.lowest, self.rules.highest).astype(self.cell_format.dtype, copy=False)
-        times, start_ns = blocks.times, self.manifest.times_start_ns
-        if times is not None and entry.times_start_ns not in (start_ns, None) and start_ns is not None:
-            later = (entry.times_start_ns - start_ns) // UNIT_NS
+        times, begun_ns, start_ns = blocks.times, entry.times_start_ns, self.manifest.times_start_ns
+        if times is not None and begun_ns is not None and start_ns is not None and begun_ns != start_ns:
+            later = (begun_ns - start_ns) // UNIT_NS
             moved = np.clip(times.astype(np.int64) + later, NEVER + 1, LAST).astype(np.uint32)
             times = np.where(times == NEVER, times, moved)
         return BoxBlocks(blocks.coords, cells, times, start_ns)

@@ -65,22 +65,22 @@ class GpuEvidence(Evidence):
         return cls(arrays, len(evidence.coords), len(evidence.uniform))
 
     @cached_property
-    def coords(self) -> NDArray[np.int32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def coords(self) -> NDArray[np.int32]:
         """Block coordinates (n, 3)."""
         return from_gpu(self.arrays.coords, self.n)
 
     @cached_property
-    def values(self) -> NDArray[np.int16]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def values(self) -> NDArray[np.int16]:
         """Evidence (n, 512)."""
         return from_gpu(self.arrays.values, self.n)
 
     @cached_property
-    def uniform(self) -> NDArray[np.int32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def uniform(self) -> NDArray[np.int32]:
         """Coordinates (m', 3) of the uniform blocks that count."""
         return from_gpu(self.arrays.uniform, self.m)[self._counts]
 
     @cached_property
-    def uniform_values(self) -> NDArray[np.int16]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def uniform_values(self) -> NDArray[np.int16]:
         """Evidence for all cells of each (m',)."""
         return from_gpu(self.arrays.steps, self.m)[self._counts]
 
@@ -255,7 +255,7 @@ class GpuPool:
 class GpuStorage(Storage):
     """The blocks of a map without bounds, on a graphics card. Raises MemoryError if not even an empty one fits."""
 
-    _pool: GpuPool  # pyright: ignore[reportIncompatibleVariableOverride] - set once
+    _pool: GpuPool  # pyrefly: ignore[bad-override] - set once
 
     def __init__(self, config: Config):
         super().__init__(config)

@@ -344,9 +344,9 @@ class RollingStorage(Storage):
 
     def _clear_borders(self) -> None:
         assert self._window.box is not None
-        blocks = coarser(self._window.box, SIDE)
-        around = tuple(tuple(SIDE * x for x in corner) for corner in blocks)
-        for slab in without(around, self._window.box):  # pyright: ignore
+        (a, b, c), (d, e, f) = coarser(self._window.box, SIDE)
+        around = (SIDE * a, SIDE * b, SIDE * c), (SIDE * d, SIDE * e, SIDE * f)
+        for slab in without(around, self._window.box):
             self._drop(slab, self._window.box)
 
 
@@ -359,7 +359,7 @@ class RollingMap(VoxelMap):
     removes the tiles.
     """
 
-    storage: RollingStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
+    storage: RollingStorage  # pyrefly: ignore[bad-override-mutable-attribute] - set once
 
     def __init__(self, config: Config, tiles: Path | None = None):
         super().__init__(config, storage=RollingStorage(config, tiles))
@@ -381,4 +381,4 @@ def _window_of(config: Config) -> WindowConfig:
 def _listed(box: Box, other: Box) -> Iterator[Tile]:
     """Yield the tiles of `box` that are not in `other`."""
     for low, high in without(box, other):
-        yield from product(*(range(a, b) for a, b in zip(low, high, strict=True)))  # pyright: ignore
+        yield from product(range(low[0], high[0]), range(low[1], high[1]), range(low[2], high[2]))

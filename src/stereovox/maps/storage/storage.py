@@ -66,7 +66,7 @@ class OnStorage(WithHistory):
         return self.storage.history
 
     @history.setter
-    def history(self, history: History) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def history(self, history: History) -> None:
         self.storage.history = history
 
 

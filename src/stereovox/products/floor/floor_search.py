@@ -78,7 +78,7 @@ class FloorSearch:
 
     def _grown(self, surfaces: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the floor among surfaces (N, 3) row, column, level: the group it starts from, and its islands."""
-        group = components(surfaces, [(*way, rise) for way in BESIDE for rise in range(-self._climb, self._climb + 1)])
+        group = components(surfaces, [(i, j, rise) for i, j in BESIDE for rise in range(-self._climb, self._climb + 1)])
         first = self._first(surfaces, group)
         if first is None:
             return np.full(self._floor.shape, NO_SURFACE, np.int64)

@@ -109,7 +109,7 @@ def ground_levels(
             f"the map has no ground: nothing occupied with {height:g} m free above it; is the map's `up` right?"
         )
     climb = int(step / floor.side + TIE)
-    group = components(surfaces, [(*way, rise) for way in BESIDE for rise in range(-climb, climb + 1)])
+    group = components(surfaces, [(i, j, rise) for i, j in BESIDE for rise in range(-climb, climb + 1)])
     here = None if start is None else place_of(floor, start)
     first = _lowest_large(surfaces, group) if here is None else group[nearest_surface(floor, surfaces, here)]
     levels = one_level(floor.shape, surfaces[group == first], here)

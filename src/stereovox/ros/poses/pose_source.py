@@ -58,6 +58,7 @@ class PoseSource(Protocol):
 
     def update(self) -> None:
         """Publish what is due."""
+        return
 
     def finish(self) -> dict[str, Any]:
         """Finish, and return figures for the report."""

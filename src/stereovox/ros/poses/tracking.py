@@ -172,7 +172,7 @@ class Tracking:
         self.state = f"lost: {tracked.lost}" if tracked.lost else "tracked"
         if not tracked.lost:
             self._move(frame.stamp_ns, tracked.T_world_sensor, tracked.covariance)
-        return posed(frame, tracked)  # pyright: ignore[reportReturnType] - it keeps the type of the frame
+        return posed(frame, tracked)
 
     def counts(self) -> Mapping[str, object]:
         """Return values for diagnostics."""

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-# pyright: reportMissingImports=false
 """A mapping node and Nav2 that plans in its map: ros2 launch nav2.launch.py depth:=/camera/camera/depth/image_rect_raw
 
 Written next to nav2_params.yaml by `stereovox ros2 --write-nav2 FOLDER`. Nav2's own map_server and AMCL are not

@@ -93,7 +93,7 @@ class FloorPlan:
         for points in map(np.array, _sampled(self.outline(*heights), resolution / 8)):
             columns, rows = (np.floor(points / resolution).astype(int) - first).T
             crossed[rows, columns] = True
-        labels = np.asarray(ndimage.label(~crossed)[0])  # pyright: ignore[reportIndexIssue] - a pair, here
+        labels = np.asarray(ndimage.label(~crossed)[0])
         column, row = np.floor(np.asarray(inside, float) / resolution).astype(int) - first
         free = (labels == labels[row, column]) & ~crossed
         seen = crossed & ndimage.binary_dilation(free, np.ones((3, 3)))

@@ -243,7 +243,7 @@ def _foreign(path: Path, size: tuple[int, int], baseline: float | None) -> Found
     numbers = read_camera_numbers(path)
     fx, fy, cx, cy = numbers.intrinsics
     notes: tuple[str, ...] = ()
-    if numbers.size not in (None, size):
+    if numbers.size is not None and numbers.size != size:
         width, height = numbers.size
         if abs(size[0] / width - size[1] / height) > 0.01 * size[0] / width:
             raise SourceError(f"{path}: is for {width}x{height} images, these have {size[0]}x{size[1]}; {OTHER}")

@@ -163,7 +163,7 @@ class RealSense(Stream):
         detail += " and put poses next to the recording in a camera pair (pair.toml)"
         return Frame(
             depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
-            fault="no_pose", fault_detail=detail, photo=self._photos and self._photos.near(stamp_ns),
+            fault="no_pose", fault_detail=detail, photo=None if self._photos is None else self._photos.near(stamp_ns),
         )  # fmt: skip
 
 

@@ -210,7 +210,8 @@ def _camera(table: dict[str, Any]) -> VirtualCamera:
     _check_keys(table, ("model", *entries), "camera.")
     needed = [name for name, entry in entries.items() if entry.default is MISSING or name == "baseline"]
     given = dict.fromkeys([*needed, *(name for name in entries if name in table)])
-    return CAMERAS[model](**{key: _count(table, key) if key in SIZES else _number(table, key) for key in given})
+    values: dict[str, Any] = {key: _count(table, key) if key in SIZES else _number(table, key) for key in given}
+    return CAMERAS[model](**values)
 
 
 def _lens(table: dict[str, Any], prefix: str) -> Lens:

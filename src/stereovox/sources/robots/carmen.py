@@ -185,7 +185,7 @@ class _Scans(Sequence[Scan]):
     def __len__(self) -> int:
         return len(self._readings)
 
-    def __getitem__(self, i):  # pyright: ignore[reportIncompatibleMethodOverride, reportMissingParameterType]
+    def __getitem__(self, i):  # pyrefly: ignore[bad-override]
         if isinstance(i, slice):
             return [self[k] for k in range(*i.indices(len(self)))]
         return _scan(self._readings[i], self._max_range, self._no_echo)

@@ -127,7 +127,7 @@ def judged_rows(judged: Sequence[Judged], kind: str) -> list[tuple[str, ...]]:
     """Return the printed rows as text, each figure with its verdict: own counts, and ours if available."""
     off = misprints()
     ours = {one.drive: one.scores[kind] for one in judged if one.mapper == THESIS}
-    rows = []
+    rows = list[tuple[str, ...]]()
     for row in PRINTED:
         scores = ours.get(SEQUENCE + row.sequence)
         cells = []

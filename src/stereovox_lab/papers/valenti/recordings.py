@@ -41,7 +41,7 @@ def find_drives(data: str | Path) -> list[Drive]:
     found = [source for source in sources if isinstance(source, LidarSource) and source.has_lidar]
     if not found:
         raise SourceError(f"{data}: no recording in it has lidar scans, which are the truth here; add its velodyne")
-    return found  # pyright: ignore[reportReturnType] - both layouts deliver stereo frames
+    return found  # pyrefly: ignore[bad-return] - both layouts deliver stereo frames
 
 
 def _places(folder: Path) -> Iterator[Path]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +73,7 @@ def read_model(folder: Path) -> ColmapModel:
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     read = (_cameras_bin, _images_bin, _points_bin) if suffix == ".bin" else (_cameras_txt, _images_txt, _points_txt)
     paths = [folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")]
-    found = []
+    found: list[Any] = []
     for path, parse in zip(paths, read, strict=True):
         try:
             found.append(parse(path, read_bounded(path, MAX_LIST)))

@@ -17,7 +17,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 HERE = Path(__file__).resolve().parents[1]
 NAMED = re.compile(r"(stereovox(?:\.\w+)+):\w+")
@@ -40,8 +40,9 @@ def main() -> None:
 def house(root: Path) -> dict[str, Any]:
     """Return the figures of the checkout at `root`."""
     modules = modules_of(root / "src" / PACKAGE)
-    lines = {name: path.read_text().count("\n") for name, path in modules.items()}
-    real, typed = import_graphs(modules)
+    read = {name: _read(name, path, modules) for name, path in modules.items()}
+    lines = {name: found.lines for name, found in read.items()}
+    real, typed = ({name: getattr(found, kind) for name, found in read.items()} for kind in ("real", "typed"))
     together = {name: real[name] | typed[name] for name in modules}
     users = Counter(other for name in modules if name != PACKAGE for other in together[name])
     alone = [name for name, count in users.items() if count == 1]
@@ -57,7 +58,7 @@ def house(root: Path) -> dict[str, Any]:
     return {
         "modules": len(modules),
         "lines": sum(lines.values()),
-        "lines of code": sum(code_lines(path.read_text()) for path in modules.values()),
+        "lines of code": sum(found.code for found in read.values()),
         "modules of the laboratory": len(laboratory),
         "lines of the laboratory": sum(text.count("\n") for text in laboratory),
         "folders": len(flat),
@@ -85,19 +86,39 @@ def modules_of(package: Path) -> dict[str, Path]:
 
 def import_graphs(modules: Mapping[str, Path]) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
     """Return each module's imports of the others: at run time, and for type checkers alone."""
-    real, typed = ({name: set() for name in modules} for _ in range(2))
-    for name, path in modules.items():
-        tree = ast.parse(path.read_text())
-        for_types = {id(inner) for node in ast.walk(tree) if _is_for_types(node) for inner in ast.walk(node)}
-        for node in ast.walk(tree):
-            for other in _imported(node, name if path.name == "__init__.py" else name.rpartition(".")[0], modules):
-                if other != name:
-                    (typed if id(node) in for_types else real)[name].add(other)
-    return real, typed
+    read = {name: _read(name, path, modules) for name, path in modules.items()}
+    return {name: found.real for name, found in read.items()}, {name: found.typed for name, found in read.items()}
 
 
-def _is_for_types(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+class Read(NamedTuple):
+    """A module: its imports of others at run time and for type checkers alone, its lines, and those of code."""
+
+    real: set[str]
+    typed: set[str]
+    lines: int
+    code: int
+
+
+def _read(name: str, path: Path, modules: Mapping[str, Path]) -> Read:
+    text, package = path.read_text(), name if path.name == "__init__.py" else name.rpartition(".")[0]
+    real, typed, texts = set[str](), set[str](), set[int]()
+    ahead: list[tuple[ast.AST, set[str]]] = [(ast.parse(text), real)]
+    while ahead:
+        node, into = ahead.pop()
+        if isinstance(node, ast.If) and _is_for_types(node):
+            into = typed
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            texts.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+        elif isinstance(node, ast.Import | ast.ImportFrom | ast.Constant):
+            into.update(_imported(node, package, modules))
+        ahead.extend((inner, into) for inner in ast.iter_child_nodes(node))
+    bare = [line.strip() for number, line in enumerate(text.splitlines(), 1) if number not in texts]
+    code = sum(bool(line) and not line.startswith("#") for line in bare)
+    return Read(real - {name}, typed - {name}, text.count("\n"), code)
+
+
+def _is_for_types(node: ast.If) -> bool:
+    return any("TYPE_CHECKING" in (getattr(one, "id", ""), getattr(one, "attr", "")) for one in ast.walk(node.test))
 
 
 def _imported(node: ast.AST, package: str, modules: Mapping[str, Path]) -> Iterator[str]:
@@ -110,7 +131,7 @@ def _imported(node: ast.AST, package: str, modules: Mapping[str, Path]) -> Itera
         origin = ".".join([*base, *filter(None, [node.module])])
         inner = [f"{origin}.{name.name}" for name in node.names]
         names = [name if name in modules else origin for name in inner]
-    elif isinstance(node, ast.Constant) and (text := NAMED.fullmatch(str(node.value))):
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str) and (text := NAMED.fullmatch(node.value)):
         names = [text[1]]
     yield from (name for name in names if name in modules and name != PACKAGE)
 
@@ -161,16 +182,6 @@ def between_rooms(graph: Graph) -> dict[str, set[str]]:
 
 def _room(name: str) -> str:
     return name.split(".")[1]
-
-
-def code_lines(text: str) -> int:
-    """Return the number of lines that are neither empty, comment nor docstring."""
-    texts = set[int]()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            texts.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    bare = (line.strip() for number, line in enumerate(text.splitlines(), 1) if number not in texts)
-    return sum(bool(line) and not line.startswith("#") for line in bare)
 
 
 def _shown(value: Any) -> str:

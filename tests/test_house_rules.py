@@ -72,6 +72,11 @@ def test_the_house_stays_small(figures, name):
     assert figures[name] <= MOST[name]
 
 
+def test_no_files_import_each_other_in_a_circle(figures):
+    """Wherever in them; tests/test_architecture.py shows that circles are found."""
+    assert not figures["circles with TYPE_CHECKING"]
+
+
 def prose(path):
     """Return the text of a page without its code, or the comments and sentences of a module."""
     text = path.read_text()

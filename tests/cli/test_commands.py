@@ -324,8 +324,9 @@ def test_any_name_can_be_drawn_and_told(name, recording, tmp_path, capsys):
     assert run("map", recording, "--out", tmp_path / name, "--voxel-size", 0.1) == 0
     capsys.readouterr()
     no_letter = os.fsdecode(b"\xff")
-    assert run("picture", tmp_path / name, tmp_path / "p.png", "--title", f"$\\frac $ {no_letter}", "--json") == 0
-    assert run("picture", tmp_path / name, tmp_path / "p.png", "--json") == 0
+    words = "picture", tmp_path / name, tmp_path / "p.png", "--view", "space", "--json"
+    assert run(*words, "--title", f"$\\frac $ {no_letter}") == 0
+    assert run(*words) == 0
     assert last_json(capsys) == {"picture": str(tmp_path / "p.png")}
 
 

@@ -41,7 +41,7 @@ def files_in(folder):
         ("export 1.svox OUT", "m.ply"),
         ("export 1.svox OUT", "m.npz"),
         ("export 1.svox OUT", "m.bt"),
-        ("picture 1.svox OUT", "m.png"),
+        ("picture 1.svox OUT --view space", "m.png"),
         ("eval 1.svox 2.svox --report OUT", "page"),
         ("simulate sim:floor?plan=testbed&seconds=1&scan_hz=4&depth_hz=2&image_width=64 --out OUT", "m.mcap"),
     ],

@@ -57,7 +57,7 @@ def test_a_picture_that_is_turned_upright_says_so(saved, tmp_path, capsys):
     one.save(tmp_path / "tilted.svox")
     page = tmp_path / "map.svg"
     for words, told in ((["tilted.svox"], True), (["tilted.svox", "--up=z"], False), ([saved.name], False)):
-        assert main(["picture", str(tmp_path / words[0]), str(page), *words[1:]]) == 0
+        assert main(["picture", str(tmp_path / words[0]), str(page), "--view", "space", *words[1:]]) == 0
         assert ("turned upright" in capsys.readouterr().err) == told
         assert ("turned upright" in page.read_text()) == told
 
@@ -118,7 +118,8 @@ def test_mistakes_are_one_line(saved, tmp_path, capsys, words, said):
     [("z", "500", "z = 0 to 2.5 m"), ("-y", "0.1", "-y = -2 to 0 m"), ("z", "1", None), ("-y", "-0.3", None)],
 )
 def test_a_layer_outside_the_map_is_told(saved, tmp_path, capsys, up, at, said):
-    assert main(["picture", str(saved), str(tmp_path / "map.png"), "--view", "layer", f"--up={up}", f"--at={at}"]) == 0
+    words = ["--view", "layer", "--width-mm", "80", f"--up={up}", f"--at={at}"]
+    assert main(["picture", str(saved), str(tmp_path / "map.png"), *words]) == 0
     err = capsys.readouterr().err
     assert f"outside the map ({said})" in err if said else "note:" not in err
 

@@ -25,6 +25,8 @@ NEEDED = [
     "stereovox.simulate.scenes.room",
     "scipy.interpolate",
     "trimesh.creation",
+    "zarr",
+    "matplotlib.figure",
 ]
 
 

@@ -56,13 +56,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.view.figures import ENDINGS, save
+    from stereovox.view.figures import checked, save
     from stereovox.view.scene.dark import darken
 
     arguments.file = arguments.file or _usual_file(arguments.map)
     file = Path(arguments.file)
-    if file.suffix.lower() not in ENDINGS:
-        raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; end the file's name with one")
+    checked(file, arguments.dpi)
     heading = _plain(arguments.title or Path(arguments.map).stem)
     drawn = DRAW[dimensions(arguments.map)](arguments, heading)
     if arguments.dark:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from math import pi, radians, tan
 from typing import Any
 
@@ -197,9 +198,7 @@ def map_claims() -> list[Claim]:
 
 def _along_ray() -> Claim:
     """Return how much sigma along the ray (Alg 3) changes, which is not mapped so."""
-    T, low, small = pose(), -SHAPE // 2, block_minimum(depth_image(0))
-    ours, hits = frame_log_odds(T, small, low, line_drawing)
-    theirs, _ = frame_log_odds(T, small, low, line_drawing, along_ray=True)
+    (ours, hits), (theirs, _) = _of_image(0, line_drawing), _of_image(0, line_drawing, along_ray=True)
     off = int((np.abs(PER_LOG_ODDS * (ours - theirs))[hits] > BYTES).sum())
     changed = int(((127 + PER_LOG_ODDS * ours > 180) != (127 + PER_LOG_ODDS * theirs > 180)).sum())
     text = "Alg 3 with sigma along the ray in the height of the peak, too: cells with points that would differ"
@@ -213,19 +212,28 @@ def _cells(text: str, said: NDArray[np.bool_], twin: NDArray[np.int64], ours: ND
 
 def _mapped(mapper: Mapper, walk: Callable[[Floats, Floats], Walk]) -> tuple[NDArray[Any], ...]:
     """Return the cells of which frames say more than half a byte, those with points, the twin's bytes, and ours."""
-    T, low = pose(), -SHAPE // 2
     twin, marked, said = np.full(SHAPE, 127), np.zeros(SHAPE, bool), np.zeros(SHAPE, bool)
     for i in range(FRAMES):
-        depth = depth_image(i)
-        report = mapper.add(Frame(depth, camera(), T, stamp_ns=i * 33_000_000, depth_scale=1.0))
+        report = mapper.add(Frame(depth_image(i), camera(), pose(), stamp_ns=i * 33_000_000, depth_scale=1.0))
         if report.refused:
             raise StereovoxError(report.detail)
-        total, hits = frame_log_odds(T, block_minimum(depth), low, walk)
+        total, hits = _of_image(i, walk)
         steps = np.rint(PER_LOG_ODDS * total)
         new = np.clip(twin + steps, 0, 255).astype(int)
         twin = np.where(steps == 0, twin, np.where(new == 127, 128, new))  # 127 stays "unknown"
         marked, said = marked | hits, said | (np.abs(PER_LOG_ODDS * total) > 1)
-    return said, marked, twin, dense(mapper.map, low)
+    return said, marked, twin, dense(mapper.map, -SHAPE // 2)
+
+
+@cache
+def _of_image(
+    seed: int, walk: Callable[[Floats, Floats], Walk], along_ray: bool = False
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return `frame_log_odds` of a made-up image: read-only, and the same whatever fault an audit applies."""
+    found = frame_log_odds(pose(), block_minimum(depth_image(seed)), -SHAPE // 2, walk, along_ray)
+    for array in found:
+        array.flags.writeable = False
+    return found
 
 
 def bytes_claims() -> list[Claim]:

@@ -36,15 +36,18 @@ def main() -> int:
     arguments = _arguments()
     if arguments.child:
         return _child(arguments)
-    sys.path[:0] = map(str, PLACES)
-    from targets import TARGETS
-
-    names = arguments.target or list(TARGETS)
-    results = {name: _in_a_process(name, arguments) for name in names}
+    results = {name: _in_a_process(name, arguments) for name in arguments.target or _all_targets()}
     found = sum(result["crashes"] + result["hangs"] for result in results.values())
     if arguments.json:
         print(json.dumps({"targets": results, "runs": sum(result["runs"] for result in results.values())}))
     return 1 if found else 0
+
+
+def _all_targets() -> list[str]:
+    sys.path[:0] = map(str, PLACES)
+    from targets import TARGETS
+
+    return list(TARGETS)
 
 
 def _arguments() -> argparse.Namespace:

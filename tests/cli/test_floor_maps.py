@@ -140,7 +140,7 @@ def test_the_map_s_own_picture_is_not_written_over(folder, capsys):
         (["eval", "half.yaml", "reference.yaml", "--threshold", "7"], "not a probability"),
         (["eval", "half.yaml", "nowhere.yaml"], "nowhere.yaml"),
         (["info", "nowhere.yaml"], "nowhere.yaml"),
-        (["picture", "half.yaml", "plan.jpg"], "pictures are written as .png"),
+        (["picture", "half.yaml", "plan.jpg"], "pictures are .png, .pdf or .svg"),
         (["picture", "half.yaml", "plan.png", "--view", "layer"], "always a plan"),
         (["picture", "half.yaml", "plan.png", "--up", "z"], "--up"),
     ],

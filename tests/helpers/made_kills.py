@@ -188,4 +188,8 @@ def kill_at_steps(kind, folder, kills):
 
 if __name__ == "__main__":
     engine.REST = 0
-    print(kill_at_steps(KINDS[sys.argv[1]], Path(sys.argv[2]), int(sys.argv[3])))
+    for words in sys.argv[2:]:  # in one process, which imports and compiles once for all
+        kind, kills = words.rsplit(":", 1)
+        place = Path(sys.argv[1]) / kind
+        place.mkdir()
+        print(kind, kill_at_steps(KINDS[kind], place, int(kills)), sep=":", flush=True)

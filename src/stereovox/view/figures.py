@@ -25,7 +25,7 @@ def keep_clear(axis: Any) -> None:
 
     Call it once all panels of the figure exist: only the finished layout determines this one's width.
     """
-    _lay_out(axis.figure)
+    axis.figure.draw_without_rendering()
     legend = axis.get_legend()
     if not covered(axis):
         return
@@ -38,13 +38,6 @@ def keep_clear(axis: Any) -> None:
         handlelength=1.2,
         fontsize=legend.get_texts()[0].get_fontsize(),
     )
-
-
-def _lay_out(figure: Any) -> None:
-    """Place the panels of a figure without drawing it, which takes several times as long."""
-    for axis in figure.axes:
-        axis.apply_aspect()
-    figure.get_layout_engine().execute(figure)
 
 
 def covered(axis: Any) -> bool:
@@ -114,7 +107,7 @@ def checked(path: str | Path, dpi: float | None = None) -> str:
     """Return the suffix of a picture's file; raises StereovoxError as `save`, before anything is drawn."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
-        raise StereovoxError(f"{path}: pictures are written as {', '.join(ENDINGS)}; end the file's name with one")
+        raise StereovoxError(f"{path}: pictures are .png, .pdf or .svg; give a name that ends so")
     if dpi is not None and not MIN_DPI <= dpi <= MAX_DPI:
         raise StereovoxError(f"--dpi {dpi:g}: give {MIN_DPI} to {MAX_DPI} dots an inch")
     return ending
@@ -131,8 +124,4 @@ def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
     ending = checked(path, dpi)
     undated = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[ending]
     with replacing(path, StereovoxError) as file, rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):
-        if ending == ".png" and figure.get_layout_engine() is not None:
-            figure.set_dpi(dpi or figure.dpi)
-            _lay_out(figure)
-            figure.set_layout_engine("none")  # else savefig draws the whole page once more, only to place its panels
         figure.savefig(file, dpi=dpi or figure.dpi, format=ending[1:], metadata=undated)

@@ -15,6 +15,7 @@ from made_frames import a_recording
 from stereovox import load_config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.mapper import Mapper, UpdateReport
+from stereovox.opening import open_source
 from stereovox_lab.bench import growth, start
 from stereovox_lab.bench.growth import cost_along_path, cost_by_map_size, far_blocks, path_table, ratio_of, size_table
 from stereovox_lab.bench.more import MEASUREMENTS, Given, check_names
@@ -220,7 +221,13 @@ def test_the_ratio_of_a_path_is_that_of_pieces():
     assert error == pytest.approx(0.02 / np.sqrt(19), abs=1e-4)
 
 
-def test_a_path_compares_the_old_map_with_one_begun_near_the_end(monkeypatch):
+@pytest.fixture
+def narrow(monkeypatch):
+    """Makes the images of flights narrow: what is measured on them is the same."""
+    monkeypatch.setattr(growth, "open_source", lambda name: open_source(f"{name}&image_width=64"))
+
+
+def test_a_path_compares_the_old_map_with_one_begun_near_the_end(narrow, monkeypatch):
     """Maps that take a microsecond more for each frame they hold."""
     told, added = [], []
 
@@ -247,7 +254,7 @@ def test_a_path_compares_the_old_map_with_one_begun_near_the_end(monkeypatch):
     assert second == first[-400:]
 
 
-def test_a_path_is_flown_straight_on_into_new_space(monkeypatch):
+def test_a_path_is_flown_straight_on_into_new_space(narrow, monkeypatch):
     monkeypatch.setattr(growth, "MAPS", {"unbounded": {"voxel_size": 0.4, "max_range": 2.0}})
     result = cost_along_path(500)
     row = result["rows"][0]
@@ -261,7 +268,7 @@ def test_a_path_that_is_too_short_is_refused():
         cost_along_path(499)
 
 
-def test_every_measurement_has_a_table(monkeypatch):
+def test_every_measurement_has_a_table(narrow, monkeypatch):
     """All by name, as `--all` calls them, the long ones made short."""
     monkeypatch.setattr(growth, "ROUNDS", 1)
     coarse = {"voxel_size": 0.4, "max_range": 2.0}

@@ -43,12 +43,12 @@ class OnBlocks(OnStorage):
         return self.storage.kept
 
     @property
-    def listeners(self) -> list[Callable[[Evidence], None]]:
+    def listeners(self) -> list[Callable[[Evidence], object]]:
         """Called with the evidence after every `add`, the lock held; see `Storage`."""
         return self.storage.listeners
 
     @listeners.setter
-    def listeners(self, listeners: list[Callable[[Evidence], None]]) -> None:
+    def listeners(self, listeners: list[Callable[[Evidence], object]]) -> None:
         self.storage.listeners = listeners
 
 

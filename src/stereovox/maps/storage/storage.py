@@ -96,7 +96,7 @@ class Storage(Guarded):
         self.history = History()
         self.viewpoint: Viewpoint | None = None
         self.window_state: dict[str, Any] | None = None
-        self.listeners: list[Callable[[Evidence], None]] = []
+        self.listeners: list[Callable[[Evidence], object]] = []
         self.kept: KeptFrames | None = None
         self.rules = CellRules(config.map)
         self.cell_format = self.rules.format

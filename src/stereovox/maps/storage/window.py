@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from math import ceil, exp, floor, hypot, isfinite
-from typing import Any, TypeVar
+from typing import Any
 
 from stereovox.config import Config
 
 Cell = tuple[int, int, int]
-N = TypeVar("N", int, float)
 Box = tuple[Cell, Cell]
 """Lowest cell, and the first cell beyond the highest, on each axis."""
 GROWTH = 8
@@ -50,8 +49,8 @@ class Window:
         self._track(position, stamp_ns)
         self._extent = self._wanted_extent()
         centre = [self._centre(axis, position[axis]) for axis in range(3)]
-        low = _triple(c - n // 2 for c, n in zip(centre, self._extent, strict=True))
-        self.box = box = low, _triple(a + n for a, n in zip(low, self._extent, strict=True))
+        low = _three((c - n // 2 for c, n in zip(centre, self._extent, strict=True)), int)
+        self.box = box = low, _three((a + n for a, n in zip(low, self._extent, strict=True)), int)
         return box
 
     @property
@@ -68,7 +67,7 @@ class Window:
         Raises KeyError, TypeError, ValueError or OverflowError for an invalid `state`, and then changes nothing.
         """
         low, high = (_three(corner, int, FURTHEST) for corner in state["box"])
-        extent = _triple(b - a for a, b in zip(low, high, strict=True))
+        extent = _three((b - a for a, b in zip(low, high, strict=True)), int)
         if any(n < least or n > most for n, least, most in zip(extent, self._size, self.largest, strict=True)):
             raise ValueError(f"a box of {extent} cells")
         velocity = _three(state["velocity"], float, JUMP_MPS)
@@ -84,13 +83,13 @@ class Window:
         if hypot(*now) > JUMP_MPS:
             now = self._velocity = (0.0, 0.0, 0.0)
         share = 1 - exp(-seconds / SMOOTHING_S)
-        self._velocity = _triple(v + share * (n - v) for v, n in zip(self._velocity, now, strict=True))
+        self._velocity = _three((v + share * (n - v) for v, n in zip(self._velocity, now, strict=True)), float)
 
     def _wanted_extent(self) -> Cell:
         if not self._grow_s or self._fixed is not None:
             return self._size
         sizes = zip(self._size, self.largest, self._extent, self._velocity, self._cell, strict=True)
-        return _triple(self._grown(*numbers) for numbers in sizes)
+        return _three((self._grown(*numbers) for numbers in sizes), int)
 
     def _grown(self, least: int, most: int, now: int, velocity: float, cell: float) -> int:
         extra = abs(velocity) * self._grow_s / cell
@@ -122,20 +121,20 @@ def without(box: Box, other: Box) -> Iterator[Box]:
     for axis in range(3):
         start, end = max(other[0][axis], low[axis]), min(other[1][axis], high[axis])
         if start >= end:
-            yield _triple(low), _triple(high)
+            yield _three(low, int), _three(high, int)
             return
         for a, b in ((low[axis], start), (end, high[axis])):
             if a < b:
                 piece_low, piece_high = low.copy(), high.copy()
                 piece_low[axis], piece_high[axis] = a, b
-                yield _triple(piece_low), _triple(piece_high)
+                yield _three(piece_low, int), _three(piece_high, int)
         low[axis], high[axis] = start, end
 
 
 def coarser(box: Box, cells: int) -> Box:
     """Return the box of larger cells (`cells` along each side) that `box` touches."""
     low, high = box
-    return _triple(a // cells for a in low), _triple(-(-b // cells) for b in high)
+    return _three((a // cells for a in low), int), _three((-(-b // cells) for b in high), int)
 
 
 def most_touched(extent: Cell, cells: int) -> int:
@@ -144,12 +143,6 @@ def most_touched(extent: Cell, cells: int) -> int:
     for n in extent:
         number *= (n - 2) // cells + 2 if n > 1 else 1
     return number
-
-
-def _triple(numbers: Iterable[N]) -> tuple[N, N, N]:
-    """Return numbers on three axes."""
-    x, y, z = numbers
-    return x, y, z
 
 
 def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]:
@@ -162,4 +155,4 @@ def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]
 
 def size_in_cells(size: Sequence[float], cell: Sequence[float]) -> Cell:
     """Return the length in cells of a box of this size in metres on each axis, at least one."""
-    return _triple(max(1, floor(x / c + 0.5)) for x, c in zip(size, cell, strict=True))
+    return _three((max(1, floor(x / c + 0.5)) for x, c in zip(size, cell, strict=True)), int)

@@ -83,12 +83,7 @@ class LiveProjection:
         self._changed = EVERYWHERE.copy()
         self._canvas = _Canvas()
         note = WeakMethod(self._note)  # the map must not keep its observer alive
-
-        def listener(evidence: Evidence) -> None:
-            if (method := note()) is not None:
-                method(evidence)
-
-        voxel_map.storage.listeners.append(listener)
+        voxel_map.storage.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
     @property
     def floor(self) -> FloorHeights:

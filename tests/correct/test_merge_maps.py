@@ -151,7 +151,7 @@ def test_two_halves_of_a_real_kitchen_are_one_run():
 
 def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch):
     pytest.importorskip("gtsam")
-    a, b = of_walk(RING, 0, 200), of_walk(RING.replace("seed=3", "seed=8"), 60, 180, elsewhere=True)
+    a, b = of_walk(RING, 0, 120), of_walk(RING.replace("seed=3", "seed=8"), 60, 120, elsewhere=True)
     for one in (a, b):
         monkeypatch.setattr(one, "recording", "walk")
     steps = []

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from made_images import cells_of, made_image
 from numba.core.config import ENABLE_CUDASIM
-from numba.cuda.simulator.kernel import BlockThread
+from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray, FakeWithinKernelCUDAArray
+from numba.cuda.simulator.kernel import BlockManager, BlockThread
 
 import stereovox as sv
 from stereovox.errors import ConfigError, FrameRefused
@@ -39,6 +40,22 @@ def _patience(monkeypatch):
     monkeypatch.setattr(BlockThread, "is_alive", lambda thread: thread.join(0.0005) or alive(thread))
 
 
+def bare(value):
+    """Return an array as NumPy's, which finds indices out of range as well, and is read in a third of the time."""
+    if isinstance(value, FakeWithinKernelCUDAArray):
+        return bare(value._item)
+    if isinstance(value, tuple):
+        parts = [bare(part) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value._ary if isinstance(value, FakeCUDAArray) else value
+
+
+@pytest.fixture(autouse=True)
+def _bare_arrays(monkeypatch):
+    run = BlockManager.run
+    monkeypatch.setattr(BlockManager, "run", lambda self, point, *given: run(self, point, *map(bare, given)))
+
+
 @pytest.fixture(autouse=True)
 def _little_room(monkeypatch):
     """Filling memory takes the simulator long."""
@@ -52,7 +69,7 @@ def image_of(seed, camera=SMALL, scale=1.0):
 
 def frame_of(n):
     """Return frame `n` of a camera that stands still, before which a wall moves to and fro."""
-    image = image_of(7, scale=1 + 0.2 * (n // 2 % 2))
+    image = image_of(7, scale=1 + 0.2 * (n % 2))
     return sv.Frame(image.depth_m, SMALL, image.T_world_sensor, stamp_ns=10**9 * n)
 
 
@@ -68,7 +85,7 @@ def assert_same_evidence(image, **settings):
 
 @pytest.mark.parametrize("model", SENSORS)
 def test_evidence_is_that_of_the_processor(model):
-    assert_same_evidence(image_of(1), voxel_size=0.2, max_range=2.5, **{"sensor.model": model})
+    assert_same_evidence(image_of(1), voxel_size=0.25, max_range=2.5, **{"sensor.model": model})
 
 
 def test_wholly_free_blocks_are_those_of_the_processor():
@@ -158,12 +175,12 @@ def numbers(reports):
 
 
 def mapped(device, frames, **settings):
-    mapper = sv.Mapper(voxel_size=0.25, max_range=2.5, device=device, **settings)
+    mapper = sv.Mapper(**{"voxel_size": 0.25, "max_range": 2.5, "device": device, **settings})
     return mapper, [mapper.add(frame_of(n)) for n in range(frames)]
 
 
 def test_a_mapper_maps_as_on_the_processor():
-    (ours, mine), (theirs, its) = mapped("cuda", 3), mapped("cpu", 3)
+    (ours, mine), (theirs, its) = mapped("cuda", 2), mapped("cpu", 2)
     assert numbers(mine) == numbers(its)
     assert all(report.cells for report in mine)
     assert_same_map(ours.map, theirs.map)
@@ -171,7 +188,7 @@ def test_a_mapper_maps_as_on_the_processor():
 
 
 def test_quality_levels_run_on_the_card():
-    ours, reports = mapped("cuda", 1, deadline_ms=1e6)
+    ours, reports = mapped("cuda", 1, deadline_ms=1e6, voxel_size=0.5)
     assert reports[0].refused is None
     assert type(ours.map.storage) is maps_gpu.GpuStorage
 

@@ -109,12 +109,12 @@ class Tail(Late):
 
 
 @pytest.mark.parametrize("model", [Late(False), Late(True), Tail(False)], ids=["late", "marks late", "tail"])
-@pytest.mark.parametrize(("voxel_size", "far_share"), [(0.1, 0.0), (0.1, 0.1), (0.05, 0.1)])
-def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, monkeypatch):
+@pytest.mark.parametrize(("voxel_size", "max_range", "far_share"), [(0.1, 4.0, 0.0), (0.1, 4.0, 0.1), (0.05, 3.0, 0.1)])
+def test_models_that_speak_of_what_lies_behind(model, voxel_size, max_range, far_share, monkeypatch):
     from stereovox.integrate import projective
 
     monkeypatch.setattr(projective, "make_sensor", lambda config: model)
-    config = load_config(voxel_size=voxel_size, max_range=4.0, **{"noise.s2": 0.03})
+    config = load_config(voxel_size=voxel_size, max_range=max_range, **{"noise.s2": 0.03})
     image = made_image(2, far_share=far_share)
     ours = cells_of(make_integrator(config).evidence(image))
     theirs = reference_of(naive_integrators.project, image, config, model)

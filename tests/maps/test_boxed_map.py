@@ -202,7 +202,7 @@ class VoxelCells:
 
 
 def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
-    sv.save_boxed(part(), where, BOX_M)
+    sv.save_boxed(part(), where, 2 * BOX_M)
     before = sv.load_map(where).storage.blocks()
 
     def stop(*_):
@@ -212,9 +212,9 @@ def test_a_new_map_replaces_the_old_one_whole_or_not_at_all(where, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(boxed_map, "write_boxed_manifest", stop)
         with pytest.raises(KeyboardInterrupt):
-            sv.save_boxed(other, where, 0.8)
+            sv.save_boxed(other, where, BOX_M)
     assert_same(sv.load_map(where).storage.blocks(), before)
-    sv.save_boxed(other, where, 0.8)
+    sv.save_boxed(other, where, BOX_M)
     assert_same(sv.load_map(where).storage.blocks(), other.storage.blocks())
     names = {"/".join(name.split("/")[:3]) for name in Place.of(where).names("boxes/")}
     assert names == read_boxed_manifest(Place.of(where)).names

@@ -173,9 +173,13 @@ def test_repetitive_texture_seems_nearer_by_its_period():
     assert (np.abs(errors(device, 0.5, 4)) > 1).mean() < wrong.mean() / 3
 
 
+def _seen(name, seed):
+    return open_source(f"sim:room?camera={name}&seed={seed}&image_width=212").frame(9)
+
+
 def test_the_same_seed_gives_the_same_image_and_another_another():
     for name in ("d435", "kinect"):
-        once, again, other = (open_source(f"sim:room?camera={name}&seed={seed}").frame(9) for seed in (1, 1, 2))
+        once, again, other = (_seen(name, seed) for seed in (1, 1, 2))
         np.testing.assert_array_equal(once.depth, again.depth)
         assert (once.depth != other.depth).mean() > 0.3
 

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.poses.live_poses import KEPT, LivePoses
+from stereovox.sources.poses import live_poses
+from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.poses import Poses
 
 MS = 1_000_000
@@ -160,12 +161,13 @@ def _forgiving(read):
     return run
 
 
-def test_the_memory_is_bounded():
+def test_the_memory_is_bounded(monkeypatch):
+    monkeypatch.setattr(live_poses, "KEPT", 200)
     poses = LivePoses()
-    for k in range(3 * KEPT):
+    for k in range(600):
         poses.add(k * MS, pose())
-    assert KEPT // 2 <= len(poses) <= KEPT
-    assert poses.newest_ns == (3 * KEPT - 1) * MS
+    assert 100 <= len(poses) <= 200
+    assert poses.newest_ns == 599 * MS
 
 
 def test_a_clock_that_was_set_back_drops_what_came_before():

@@ -76,6 +76,14 @@ def test_one_recording_makes_the_map_of_one_mapper(mapped, where):
     assert sv.load_map(where).overview().counts() == own.counts()
 
 
+def test_frames_that_are_taken_back_are_in_no_box(mapped, tmp_path):
+    """The fourth frame contradicts the three before it, and the map begins anew."""
+    jumping = recording(1, step=140)
+    own = alone(jumping)
+    assert own.frames == 3
+    assert_same(mapped([jumping], tmp_path / "m.svox").map.storage.blocks(), own.storage.blocks())
+
+
 def test_clouds_and_depth_images_of_several_machines_make_one_map(mapped, tmp_path):
     clouds = [room_cloud(n, 3000) for n in range(8)]
     (tmp_path / "lidar" / "velodyne").mkdir(parents=True)

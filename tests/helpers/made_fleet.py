@@ -33,11 +33,11 @@ def write_folder(folder, frames):
 
 
 @cache
-def recording(number):
+def recording(number, step=70):
     """Return the folder of a short recording, one of several ways through the same rooms."""
     folder = Path(mkdtemp(prefix="stereovox-test-")) / f"drive{number}"
     atexit.register(shutil.rmtree, folder.parent)
-    frames = list(sv.open_source(f"sim:apartment?image_width=64&seed={number}", f"{20 * number}::140"))[:6]
+    frames = list(sv.open_source(f"sim:apartment?image_width=64&seed={number}", f"{20 * number}::{step}"))[:6]
     write_folder(folder, frames)
     return str(folder)
 

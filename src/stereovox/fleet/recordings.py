@@ -280,15 +280,14 @@ def _by_frame(
 ) -> list[NDArray[np.int64]]:
     """Return the boxes that each frame sees, as collected by a map's listener: none if there was no evidence.
 
-    If rounding depends on the frame's number, which differs among recordings, the listener's boxes are too few.
+    If rounding depends on the frame's number, which differs among recordings, the listener's boxes are too few; if
+    frames were taken back, they are too many. All boxes around each frame serve then.
     """
-    if layout.config.map.cell != "int16":
+    saying = [bool((frame.blocks[1] > frame.blocks[0]).all()) for frame in frames]
+    if layout.config.map.cell != "int16" or len(by_frame) != sum(saying):
         return [_around(layout, frame) for frame in frames]
-    coming = iter(by_frame)
-    nothing = np.empty((0, 3), np.int64)
-    seen = [next(coming) if (frame.blocks[1] > frame.blocks[0]).all() else nothing for frame in frames]
-    assert next(coming, None) is None
-    return seen
+    coming, nothing = iter(by_frame), np.empty((0, 3), np.int64)
+    return [next(coming) if says else nothing for says in saying]
 
 
 def _around(layout: BoxLayout, frame: KeptFrame) -> NDArray[np.int64]:

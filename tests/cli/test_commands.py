@@ -208,7 +208,7 @@ MISTAKES = [
     ("greater than 0", ["bench", "{rec}", "--voxel-size", "0"]),
     ("threads 0", ["bench", "{rec}", "--threads", "0"]),
     ("no stereovox map here", ["export", "{tmp}/gone", "{tmp}/x.bt"]),
-    ("written as .png", ["picture", "{tmp}/gone", "x.jpg"]),
+    ("pictures are .png", ["picture", "{tmp}/gone", "x.jpg"]),
     ("must be smaller", ["map", "{rec}", "--out", "{tmp}/m", "--set", "map.free_below=0.9"]),
     ("log_odds_min", ["map", "{rec}", "--out", "{tmp}/m", "--set", "map.log_odds_min=high"]),
 ]

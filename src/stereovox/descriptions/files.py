@@ -16,7 +16,8 @@ from stereovox.sources.rgbd.depth_unit import unit_words
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".bmp", ".webp", ".ppm", ".pgm")
 IMAGE_SUFFIXES = (*SUFFIXES, *PICTURE_SUFFIXES)
-TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".xml", ".csv", ".log", ".tum", ".freiburg")
+TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".xml", ".csv", ".log", ".tum", ".freiburg",
+                 ".g2o", ".traj")  # fmt: skip
 LOOSE = (".txt", ".csv", ".bin", ".npz")
 """Endings of clouds and cells that many other files share."""
 SEE = "what each may hold: docs/recordings.md, docs/formats.md"
@@ -131,14 +132,16 @@ def describe_calibration(path: str) -> Description | None:
 
 
 def describe_poses(path: str) -> Description | None:
-    """Describe a file or folder of poses; None for anything else."""
+    """Describe a file or folder of poses; None for anything else. Raises SourceError without quaternions."""
     from stereovox.sources.poses.poses import Poses
-    from stereovox.sources.rgbd.pose_files import read_poses
+    from stereovox.sources.rgbd.pose_files import UnknownRotationError, read_poses
 
     if not _is_text(path):
         return None
     try:
         found = read_poses(Path(path))
+    except UnknownRotationError:
+        raise
     except (SourceError, FrameRefused):
         return None
     if isinstance(found, Poses):

@@ -8,6 +8,7 @@ import pytest
 from made_depth import matrix_line, posed, tum_line
 from scipy.spatial.transform import Rotation
 
+from stereovox.descriptions import describe
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.pose_files import (
@@ -178,6 +179,10 @@ def timed_forms():
                 *map(str, np.linalg.inv(T)[:3, 3])] for T in posed()]  # fmt: skip
     euroc = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
     euroc += "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]"
+    okvis = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x, v_WS_W_y, v_WS_W_z, "
+    okvis += "b_g_x, b_g_y, b_g_z, b_a_x, b_a_y, b_a_z"
+    aria = "graph_uid,tracking_timestamp_us,utc_timestamp_ns," + ",".join(f"t{k}_world_device" for k in "xyz")
+    aria += "," + ",".join(f"q{k}_world_device" for k in "xyzw") + ",device_linear_velocity_x_device"
     echo = "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,"
     echo += ",".join(f"field.pose.pose.position.{k}" for k in "xyz") + ","
     echo += ",".join(f"field.pose.pose.orientation.{k}" for k in "xyzw") + ",field.pose.covariance0,"
@@ -189,12 +194,18 @@ def timed_forms():
     both = list(zip(ns, xyzw, wxyz, strict=True))
     return {
         "EuRoC": (euroc, ",", [[t, *w, *zero, "0.5"] for t, _, w in both]),
-        "rostopic -p": (echo, ",", [[t, "7", t, "odom", "base", *q, "0.01", *zero] for t, q, _ in both]),
+        "rostopic -p": (echo, ",", [[f"{t[:-8]}99999999", "7", t, "odom", "base", *q, "0.01", *zero]
+                               for t, q, _ in both]),
         "AirSim": ("VEHICLE TIMESTAMP POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile".replace(" ", "\t"), "\t",
                    [["", t, *w, "img_0.png"] for t, w in zip(ms, wxyz, strict=True)]),
         "OpenVINS": (vins, " ", [[t, *q, *["0.01"] * 12] for t, q in zip(seconds, xyzw, strict=True)]),
         "Newer College": ("#sec,nsec,x,y,z,qx,qy,qz,qw", ",", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
         "the same without a heading": ("", " ", [[*t, *q] for t, q in zip(split, xyzw, strict=True)]),
+        "OpenVINS without its heading": ("", " ", [[t, *q, *["0.01"] * 12]
+                                                   for t, q in zip(seconds, xyzw, strict=True)]),
+        "OKVIS": (okvis, ", ", [[t, *q, *zero, *zero, *zero] for t, q, _ in both]),
+        "Aria": (aria, ",", [["1f-2", str(int(t) // 1000), t, *q, "0"] for t, q, _ in both]),
+        "TUM's columns named": ("timestamp,x,y,z,qx,qy,qz,qw", ",", [[t, *q] for t, q, _ in both]),
         "VINS": ("", ",", [[t, *w, *zero, ""] for t, _, w in both]),
         "VINS after loops": ("", ",", [[t, *w, ""] for t, _, w in both]),
         "TUM with commas": ("", ",", [[t, *q] for t, q in zip(seconds, xyzw, strict=True)]),
@@ -209,7 +220,7 @@ def timed_forms():
 @pytest.mark.parametrize("name", timed_forms())
 def test_poses_over_time_by_their_columns(tmp_path, name):
     heading, separator, rows = timed_forms()[name]
-    path = tmp_path / "poses.csv"
+    path = tmp_path / ("poses.traj" if name == "ARKit" else "poses.csv")
     path.write_text(f"{heading}\n" * bool(heading) + "".join(f"{separator.join(row)}\n" for row in rows))
     found = read_poses(path)
     assert isinstance(found, Poses)
@@ -246,3 +257,63 @@ def test_a_damaged_vertex_of_a_graph_is_not_left_out(tmp_path, vertex):
     (tmp_path / "graph.g2o").write_text(f"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n{vertex}\n")
     with pytest.raises(SourceError, match="correct"):
         read_poses(tmp_path / "graph.g2o")
+
+
+def test_a_graph_is_read_in_the_order_of_its_ids(tmp_path):
+    """g2o keeps vertices in a hash table and writes them in any order."""
+    lines = [f"VERTEX_SE3:QUAT {7 * k} {' '.join(row)}\n" for k, row in enumerate(rows_of(posed()))]
+    (tmp_path / "graph.g2o").write_text("".join(lines[k] for k in (2, 0, 3, 1)))
+    found = read_poses(tmp_path / "graph.g2o")
+    np.testing.assert_allclose([found.at(k) for k in range(4)], posed(), atol=1e-8)
+    (tmp_path / "graph.g2o").write_text("".join([*lines, lines[1]]))
+    with pytest.raises(SourceError, match="one id"):
+        read_poses(tmp_path / "graph.g2o")
+
+
+def test_a_heading_may_number_the_images(tmp_path):
+    rows = [f"{9 * k};{';'.join(row)}\n" for k, row in enumerate(rows_of(posed(), "wxyz"))]
+    (tmp_path / "poses.csv").write_text("frame;x;y;z;qw;qx;qy;qz\n" + "".join(rows))
+    found = read_poses(tmp_path / "poses.csv")
+    assert found.numbers == [0, 9, 18, 27]
+    np.testing.assert_allclose([found.at(k) for k in range(4)], posed(), atol=1e-8)
+
+
+AMBIGUOUS = {
+    "time, place, angles": ("timestamp,x,y,z,roll,pitch,yaw", [1.5, 2, 3, 4, 0.1, 0.2, 0.3], "no quaternion"),
+    "the same without a heading": ("", [1.5, 2, 3, 4, 0.1, 0.2, 0.3], "no quaternions"),
+    "places alone": ("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]", [1.5, 2, 3, 4], "no quaternion"),
+    "places alone without a heading": ("", [1.5, 2, 3, 4], "do not rotate"),
+    "quaternions in an unknown order": ("t x y z q[0] q[1] q[2] q[3]", [1, 2, 3, 4, 1, 0, 0, 0], "no quaternion"),
+    "unknown names": ("a,b,c,d,e,f,g,h", [1, 2, 3, 4, 0, 0, 0, 1], "names no position"),
+    "17 numbers": ("", list(range(17)), "do not rotate"),
+    "a graph in a plane": ("VERTEX_SE2 1 2 3 0.1", [], "graph without"),
+    "angles of a confidence": ("", [1.5, 2, 3, 4, 0.1, 0.2, 0.3, 1.5], "no quaternions"),
+}
+
+
+@pytest.mark.parametrize("name", AMBIGUOUS)
+def test_columns_that_may_mean_anything_are_refused(tmp_path, name):
+    """Each of them was read as poses of another form: a map of garbage without a word."""
+    heading, row, said = AMBIGUOUS[name]
+    rows = [[number + k * (1.1 if j else 1) for j, number in enumerate(row)] for k in range(12)] if row else []
+    if "quaternions in" in name or name == "unknown names":
+        rows = [row] * 12
+    text = "".join(f"{' '.join(map(str, row))}\n" for row in rows)
+    (tmp_path / "p.txt").write_text(
+        f"{heading}\n" * bool(heading) + (text.replace(" ", ",") if "," in heading else text)
+    )
+    with pytest.raises(SourceError, match=said) as error:
+        read_poses(tmp_path / "p.txt")
+    assert ";" in str(error.value)
+
+
+def test_a_path_without_quaternions_is_no_cloud(tmp_path):
+    (tmp_path / "p.csv").write_text("timestamp,x,y,z,roll,pitch,yaw\n" + "1.5,2,3,4,0.1,0.2,0.3\n" * 9)
+    with pytest.raises(SourceError, match="no quaternion"):
+        describe(tmp_path / "p.csv")
+    for name in ("graph.g2o", "a.traj"):
+        rows = [
+            f"{k} 0.1 0.2 0.3 {k} 2 3" if "traj" in name else f"VERTEX_SE3:QUAT {k} {k} 2 3 0 0 0 1" for k in range(9)
+        ]
+        (tmp_path / name).write_text("\n".join(rows))
+        assert describe(tmp_path / name).kind == "poses"

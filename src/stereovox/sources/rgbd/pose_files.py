@@ -11,16 +11,17 @@
 | log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
 | JSON | a PinholeCameraTrajectory (world to camera, which is inverted) | Open3D |
 | NumPy | `.npy` of (N, 4, 4), (N, 16), (N, 12) or (N, 7) numbers | scripts |
-| named columns | a time, positions and quaternions, named in a heading | EuRoC, AirSim, `rostopic -p`, OpenVINS |
+| named columns | a heading with a time or number, positions, quaternions | EuRoC, AirSim, `rostopic -p`, OpenVINS |
 | VINS | `stamp tx ty tz qw qx qy qz vx vy vz`, or without `v` if each line ends with a comma | VINS-Mono, VINS-Fusion |
 | numbered | a number or a time in nanoseconds, then 12 or 16 numbers | KITTI-360, MulRan |
 | split time | `sec nsec tx ty tz qx qy qz qw` | Newer College |
-| ARKit | `stamp rx ry rz tx ty tz`, world to camera (inverted) | ARKitScenes |
-| g2o | `VERTEX_SE3:QUAT id tx ty tz qx qy qz qw` | pose graphs |
+| ARKit | `.traj` of `stamp rx ry rz tx ty tz`, world to camera (inverted) | ARKitScenes |
+| g2o | `VERTEX_SE3:QUAT id tx ty tz qx qy qz qw`, in the order of the ids | pose graphs |
 | a folder | a file for each image, with 16 or 12 numbers or `tx ty tz qx qy qz qw` | ScanNet, 7-Scenes |
 
 All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) differ. Times are
-in seconds, or, if they have more digits than a date in seconds, in milliseconds, microseconds or nanoseconds.
+in seconds, or, if they have more digits than a date in seconds, in milliseconds, microseconds or nanoseconds. Numbers
+that are no rotations are refused.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.files.safe_io import MAX_LIST, is_number, read_bounded, read_json, read_text
@@ -46,15 +48,23 @@ MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
 SECOND = 1_000_000_000
 POSE_COLUMNS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 UNITS_NS = {"ns": 1, "nsec": 1, "us": 1000, "ms": 1_000_000}
+NUMBERS = {"frame", "id", "index", "image", "number", "idx"}
 NOT_PLACES = ("vel", "lin", "ang", "twist", "acc", "cov", "gyro", "bias", "omega")
 """Begins of names of columns that hold other vectors than positions."""
-G2O, MAX_HEADING = "VERTEX_SE3:QUAT", 20
-"""Begin of a pose of a graph, and lines in which a heading is searched for."""
-LARGEST_CONFIDENCE, NOT_UNIT, FEW_UNIT = 100, 0.02, 0.2
-"""Largest confidence of a tracker in any unit; by how much a unit quaternion's length may differ from one; share of
-other rows that may have this length by chance."""
+TURNS = ("q", "roll", "pitch", "yaw", "heading", "orient", "rot")
+"""Begins of names of columns that rotate."""
+G2O, OTHER_GRAPH, MAX_HEADING = "VERTEX_SE3:QUAT", ("VERTEX", "EDGE"), 20
+"""Begins of a pose of a graph, and of other graphs' lines; lines in which a heading is searched for."""
+LARGEST_CONFIDENCE, NOT_A_TURN = 100, 0.1
+"""Largest confidence of a tracker in any unit; by how much the entries of R^T R may differ from those of the unit
+matrix, and lengths of quaternions from their median, in most poses of a file."""
+WRITE = "write tx ty tz qx qy qz qw"
 MAX_NUMBER = 10_000_000
 """Whole stamps in seconds below this may be image numbers; times since 1970 are larger."""
+
+
+class UnknownRotationError(SourceError):
+    """Poses whose rotation is in a form that is not read."""
 
 
 class ImagePoses:
@@ -112,8 +122,10 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         return _of_json(path) if path.suffix.lower() == ".json" else _of_numpy(path)
     if (found := _by_names(path)) is not None:
         return found
-    rows = _rows(path)
+    rows, heading = _rows(path)
     widths = {len(row) for row in rows}
+    if heading and not widths <= {3, 4, 12, 13, 16, 17}:  # matrices show what they are
+        raise SourceError(f"{path}:1: its heading names no position and quaternion (tx ty tz qx qy qz qw); name them")
     if (
         widths == {9}
         and all(row[1] == int(row[1]) and 0 <= row[1] < SECOND for row in rows)
@@ -124,15 +136,20 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         return _over_time(
             path, [(ns_from_stamp(words[0]), _numbers(words[1:4] + words[5:8] + words[4:5])) for words in _words(path)]
         )
+    if widths == {20}:  # OpenVINS without its heading
+        return _over_time(path, [(ns_from_stamp(words[0]), _numbers(words[1:8])) for words in _words(path)])
     if widths and widths <= {8, 9}:  # the ninth: a tracker's confidence
+        _check_quaternions(path, np.array([row[4:8] for row in rows]))
         return Trajectory(path)
     if widths in ({13}, {17}):
         return _numbered(path)
-    if widths == {7} and _is_arkit(rows):
+    if widths == {7} and path.suffix.lower() == ".traj":
         found = [(ns_from_stamp(words[0]), _numbers(words[1:])) for words in _words(path)]
         return _over_time(path, [(stamp, _of_rotation_vector(numbers)) for stamp, numbers in found])
+    if widths == {7}:
+        _check_quaternions(path, np.array([row[3:] for row in rows]))
     if widths in ({7}, {12}, {16}):
-        return ImagePoses([_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)], str(path))
+        return _in_order(path, rows)
     if widths and widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
         return _stacked(path, [rows[k + 1 : k + 5] for k in range(0, len(rows), 5)])
     if widths == {4} and len(rows) % 4 == 0 and all(row == [0, 0, 0, 1] for row in rows[3::4]):
@@ -149,37 +166,49 @@ def _by_names(path: Path) -> Poses | ImagePoses | None:
         lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError:
         return None  # reported by `_rows`
-    graph = [line.split() for line in lines if line.startswith(G2O)]
-    if graph:
-        short = next((words for words in graph if len(words) != 9), None)
-        if short is not None:  # left out, it would shift the poses of all images after it
-            raise SourceError(f"{path}: '{' '.join(short[:3])} ...' is not '{G2O} id' and seven numbers; correct it")
-        try:
-            return ImagePoses(
-                [_matrix(_numbers(words[2:]), f"{path}: vertex {words[1]}") for words in graph], str(path)
-            )
-        except ValueError as error:
-            raise SourceError(f"{path}: {error}; correct the vertex") from None
+    if any(line.startswith(OTHER_GRAPH) for line in lines):
+        return _of_graph(path, [line.split() for line in lines if line.startswith(G2O)])
     for heading in lines[:MAX_HEADING]:
         names = [_name(word) for word in _split(heading.lstrip("#% "))]
         columns = {key: k for k, name in reversed(list(enumerate(names))) if (key := _meaning(name))}
-        if columns.keys() >= set(POSE_COLUMNS) and columns.keys() & {"time", "sec"}:
+        timed = bool(columns.keys() & {"time", "sec"})
+        if (timed or "number" in columns) and columns.keys() >= set(POSE_COLUMNS[:3]):
             break
     else:
         return None
-    if len(names) == 8 and [columns.get(key) for key in ("time", *POSE_COLUMNS)] == list(range(8)):
+    if not columns.keys() >= set(POSE_COLUMNS):
+        kind = UnknownRotationError if any(part.startswith(TURNS) for name in names for part in name) else SourceError
+        raise kind(f"{path}: its heading names positions but no quaternion; {WRITE} and name the columns so")
+    if heading.startswith("#") and [columns.get(key) for key in ("time", *POSE_COLUMNS)] == list(range(len(names))):
         return None  # TUM's own
-    found = []
+    found, numbers = list[tuple[int, list[float]]](), list[int]()
     for n, line in enumerate(lines, 1):
         words = _split(line)
         if line == heading or not words or line.lstrip().startswith(("#", "%")):
             continue
         try:
-            stamp_ns = _stamp_of(words, columns, names)
-            found.append((stamp_ns, [float(words[columns[key]]) for key in POSE_COLUMNS]))
+            row = [float(words[columns[key]]) for key in POSE_COLUMNS]
+            found.append((_stamp_of(words, columns, names) if timed else n, row))
+            numbers.append(0 if timed else int(words[columns["number"]]))
         except (ValueError, IndexError):
             raise SourceError(f"{path}:{n}: a column of the heading is missing or no number; correct it") from None
-    return _over_time(path, found)
+    return _over_time(path, found) if timed else _in_order(path, [row for _, row in found], numbers)
+
+
+def _of_graph(path: Path, vertices: Sequence[list[str]]) -> ImagePoses:
+    """Return the poses of a g2o graph in the order of their ids; programs write them in any order."""
+    if not vertices:
+        raise SourceError(f"{path}: is a graph without '{G2O} id tx ty tz qx qy qz qw'; write these, or TUM lines")
+    short = next((words for words in vertices if len(words) != 9), None)
+    if short is not None:  # left out, it would shift the poses of all images after it
+        raise SourceError(f"{path}: '{' '.join(short[:3])} ...' is not '{G2O} id' and seven numbers; correct it")
+    try:
+        rows = dict(sorted((int(words[1]), _numbers(words[2:])) for words in vertices))
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; correct the vertex") from None
+    if len(rows) < len(vertices):
+        raise SourceError(f"{path}: two vertices have one id; write each once")
+    return _in_order(path, list(rows.values()))
 
 
 def _split(line: str) -> list[str]:
@@ -194,26 +223,35 @@ def _name(word: str) -> tuple[str, ...]:
 
 
 def _meaning(name: tuple[str, ...]) -> str:
-    """Return what a column is: `time`, `sec`, `nsec`, or one of `POSE_COLUMNS`; "" for others."""
+    """Return what a column is: `time`, `sec`, `nsec`, `number`, or one of `POSE_COLUMNS`; "" for others."""
     parts = [part for part in name if part[0] not in "[("]
     *context, last = parts or [""]
-    if last in ("timestamp", "time", "stamp", "t") or context[:1] in (["timestamp"], ["time"]):
+    if context[-2:] == ["field", "header"] and last == "stamp":
+        return "time of header"
+    if last in ("timestamp", "time", "stamp", "t") or "timestamp" in context or context[:1] == ["time"]:
         return "time"
     if last in ("sec", "secs", "nsec", "nsecs"):
         return last.rstrip("s")
+    if not context and last in NUMBERS:
+        return "number"
+    if parts[0:1] != [last] and parts[0:1] and parts[0] in POSE_COLUMNS:  # Aria: tx_world_device
+        return parts[0]
     turns = last[0:1] == "q" or any(part.startswith(("q", "orient", "rot")) for part in context)
     if turns and last.lstrip("q") in ("x", "y", "z", "w"):
         return f"q{last.lstrip('q')}"
-    others = any(part in ("v", "b", "a", "w") or part.startswith(NOT_PLACES) for part in context)
+    others = context[:1] in (["v"], ["b"], ["a"], ["w"]) or any(part.startswith(NOT_PLACES) for part in context)
     place = last[1:] if last[:1] in ("t", "p") else last
     return f"t{place}" if place in ("x", "y", "z") and not others else ""
 
 
 def _stamp_of(words: list[str], columns: dict[str, int], names: list[tuple[str, ...]]) -> int:
-    """Return the time of a row in nanoseconds: its unit is in the heading, else by its digits."""
+    """Return the time of a row in nanoseconds: its unit is in the heading, else by its digits.
+
+    A header's stamp precedes the time at which the message arrived.
+    """
     if "sec" in columns and "nsec" in columns:
         return int(words[columns["sec"]]) * SECOND + int(words[columns["nsec"]])
-    column = columns.get("time", columns.get("sec", 0))
+    column = columns.get("time of header", columns.get("time", columns.get("sec", 0)))
     unit = next((part.strip("[]()") for part in names[column] if part[0] in "[("), names[column][-1])
     text = words[column]
     if unit in UNITS_NS and text.lstrip("-").isdigit():
@@ -242,29 +280,40 @@ def _over_time(path: Path, found: Sequence[tuple[int, Sequence[float]]]) -> Pose
     if not found:
         raise SourceError(f"{path}: holds no pose; write {FORMS}")
     rows = np.array([row for _, row in found], float)
+    _check_quaternions(path, rows[:, 3:])
     bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
     rows[bad] = np.nan
     with np.errstate(invalid="ignore"):
         return Poses([stamp_ns for stamp_ns, _ in found], transforms(rows), where=str(path))
 
 
+def _check_quaternions(path: Path, found: NDArray[np.float64]) -> None:
+    """Raise SourceError if most of (N, 4) numbers differ so much in length that they are no quaternions."""
+    length = np.linalg.norm(found, axis=1)
+    length = length[np.isfinite(length) & (length > 0)]
+    if len(length) and np.mean(np.abs(length / np.median(length) - 1) < NOT_A_TURN) <= 1 / 2:
+        raise SourceError(f"{path}: its columns hold no quaternions; {WRITE}, or name the columns in a heading")
+
+
+def _in_order(path: Path, rows: Sequence[Sequence[float]], numbers: list[int] | None = None) -> ImagePoses:
+    """Return the poses of rows of numbers; raises SourceError if most matrices are no rotations."""
+    poses = [_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)]
+    R = np.array([T[:3, :3] for T in poses if not isinstance(T, str) and np.isfinite(T).all()]).reshape(-1, 3, 3)
+    with np.errstate(all="ignore"):
+        off = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
+    if len(off) and np.mean(off < NOT_A_TURN) <= 1 / 2:
+        raise SourceError(f"{path}: its numbers are no poses: their 3x3 parts do not rotate; write {FORMS}")
+    return ImagePoses(poses, str(path), numbers)
+
+
 def _numbered(path: Path) -> Poses | ImagePoses:
     """Return the poses of lines of a number, or a time of many digits, and a matrix."""
     words = _words(path)
-    poses = [_matrix(_numbers(row[1:]), f"{path}, pose {row[0]}") for row in words]
+    poses = _in_order(path, [_numbers(row[1:]) for row in words], [int(float(row[0])) for row in words])
     if all(row[0].isdigit() and len(row[0]) >= MILLISECOND_DIGITS for row in words):
-        T = [np.full((4, 4), np.nan) if isinstance(one, str) else one for one in poses]
-        return Poses([ns_from_stamp(row[0]) for row in words], np.array(T), where=str(path))
-    return ImagePoses(poses, str(path), [int(float(row[0])) for row in words])
-
-
-def _is_arkit(rows: Sequence[Sequence[float]]) -> bool:
-    """Return whether rows of seven numbers are a time, a rotation vector and a position: their last four are no unit
-    quaternion, and the first ascends.
-    """
-    found = np.array(rows)
-    unit = np.mean(np.abs(np.linalg.norm(found[:, 3:], axis=1) - 1) < NOT_UNIT)
-    return len(found) > 1 and bool(unit < FEW_UNIT) and bool((np.diff(found[:, 0]) > 0).all())
+        return Poses([ns_from_stamp(row[0]) for row in words], np.array([poses.at(k) for k in range(len(words))]),
+                     where=str(path))  # fmt: skip
+    return poses
 
 
 def _of_rotation_vector(numbers: Sequence[float]) -> list[float]:
@@ -387,20 +436,23 @@ def _of_numpy(path: Path) -> ImagePoses:
     return ImagePoses([_matrix(row, f"{path}, pose {n}") for n, row in enumerate(rows.tolist())], str(path))
 
 
-def _rows(path: Path) -> list[list[float]]:
-    """Return the numbers of all lines; raises SourceError with the line for anything else."""
+def _rows(path: Path) -> tuple[list[list[float]], bool]:
+    """Return the numbers of all lines, and whether the first is a heading; raises SourceError with the line for
+    anything else.
+    """
     try:
         lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a file of poses: {FORMS}") from None
-    rows = []
+    rows, heading = [], False
     for n, line in enumerate(lines, 1):
         try:
             rows.append([float(word) for word in _plain(line)])
         except ValueError as error:
-            if n > 1:  # the first line may be a heading
+            if n > 1:
                 raise SourceError(f"{path}:{n}: {error}; correct or delete the line") from None
-    return [row for row in rows if row]
+            heading = True
+    return [row for row in rows if row], heading
 
 
 def _plain(text: str) -> list[str]:
@@ -409,7 +461,7 @@ def _plain(text: str) -> list[str]:
 
 def _stacked(path: Path, blocks: list[list[list[float]]]) -> ImagePoses:
     flat = [[number for row in block for number in row] for block in blocks]
-    return ImagePoses([_matrix(numbers, f"{path}, pose {n}") for n, numbers in enumerate(flat)], str(path))
+    return _in_order(path, flat)
 
 
 def _matrix(numbers: Sequence[float], where: str) -> Transform | str:

@@ -24,7 +24,7 @@ COMMANDS = {
 
 MOST = {
     "modules": 610,
-    "lines": 93_000,
+    "lines": 93_700,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

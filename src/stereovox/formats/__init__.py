@@ -18,7 +18,22 @@ from stereovox.maps.record.history import Imported
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.products.floor.floor_heights import FloorHeights
 
-CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".bin", ".stl", ".obj", ".off")
+CLOUDS = (
+    ".ply",
+    ".pcd",
+    ".las",
+    ".laz",
+    ".xyz",
+    ".csv",
+    ".txt",
+    ".asc",
+    ".pts",
+    ".ptx",
+    ".bin",
+    ".stl",
+    ".obj",
+    ".off",
+)
 """Endings of point clouds and meshes."""
 FLOORS = (".yaml", ".yml", ".pgm", ".png", ".bmp")
 """Endings of 2-D maps that can be read."""
@@ -45,7 +60,8 @@ OPTIONS = {
 UNREADABLE = {
     ".vdb": "no Python package reads OpenVDB grids here; write the centres of its active voxels as .xyz, one a line",
     ".bonxai": "Bonxai's files have no reader in Python; write the cells of forEachCell as .xyz, x y z a line",
-    ".e57": "convert it, for example: pdal translate scan.e57 scan.laz",
+    ".e57": "convert it with CloudCompare (save as .laz), or with: pdal translate scan.e57 scan.laz",
+    **dict.fromkeys((".splat", ".ksplat", ".spz", ".sog"), "holds Gaussian splats; let SuperSplat export them as .ply"),
     ".pcap": "holds lidar packets; let the lidar's driver write a bag or .pcd",
     ".svox": "is already a map; open it with stereovox info, picture or view",
     ".pbstream": "is Cartographer's state; let cartographer_pbstream_to_ros_map write a .yaml",

@@ -41,7 +41,7 @@ PER_CELL = 2
 MAX_LIDAR_M = 1000.0
 """Largest distance in metres of points in a KITTI scan."""
 MESHES = (".stl", ".obj", ".off")
-TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
+TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts", ".ptx")
 LAS = (".las", ".laz")
 
 
@@ -91,8 +91,9 @@ def read_cloud(path: str | Path) -> PointFile:
     if ending in LAS:
         return PointFile(**read_las(path)._asdict())
     if ending in TEXTS:
-        xyz = read_text_points(path)
-        return PointFile(xyz, f"text, {_count(xyz)}")
+        xyz, named, scans = read_text_points(path)
+        metres = ((UNITS[named],) * 3, named) if named else None
+        return PointFile(xyz, f"{f'PTX, {scans} scans' if scans else 'text'}, {_count(xyz)}", metres=metres)
     if ending == ".bin":
         return _lidar_scan(path)
     if ending in MESHES:
@@ -103,6 +104,9 @@ def read_cloud(path: str | Path) -> PointFile:
     kind = "PLY" if points.ply else "PCD"
     rows = f"{points.width} x {points.height}, " if points.height > 1 else ""
     notes = ("its VIEWPOINT is not applied: points are used as stored",) if points.turned else ()
+    if points.haze is not None:
+        kind, number = "Gaussian splats", len(points.xyz) + points.haze
+        notes = (f"{points.haze:,} of {number:,} splats are left out: their opacity is below 0.5",)
     return PointFile(points.xyz, f"{kind}, {rows}{_count(points.xyz)}", points.voxel_size, notes=notes)
 
 

@@ -236,7 +236,7 @@ def _images_alone(where: str) -> DepthSource:
     """Return depth images without poses; raises SourceError if missing."""
     for kind in _image_classes():
         if kind.recognises(where):
-            return kind(where)
+            return kind(where, posed=False)
     _recognise(where)  # which says what is wrong with it
     raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording")
 

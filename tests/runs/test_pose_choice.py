@@ -121,3 +121,19 @@ def test_an_unknown_choice_is_one_line():
         StereovoxError, match=r"^poses 'gven' is unknown \(did you mean 'given'\?\); give given, track or both$"
     ):
         choose_poses(ROOM, None, "gven")
+
+
+def test_named_poses_that_fit_no_image_are_an_error_that_says_why(tmp_path):
+    """Tracking instead would hide the cause. A limit can be set, and who asks for tracking gets it."""
+    where = unposed(tmp_path, 4, poses=True)
+    lines = [line for line in (where / "groundtruth.txt").read_text().splitlines() if not line.startswith("#")]
+    (where / "groundtruth.txt").unlink()
+    first, last = lines[0].split(), lines[-1].split()
+    first[0], last[0] = (f"{float(line[0]) + off:.6f}" for line, off in ((first, -0.3), (last, 0.4)))
+    (where / "slam.txt").write_text("\n".join(" ".join(line) for line in (first, last)) + "\n")
+    with pytest.raises(StereovoxError, match=r"the nearest is .* s away.*correct \?poses=, or give --poses track"):
+        choose_poses(f"{where}?poses=slam.txt", None, None)
+    assert choose_poses(f"{where}?poses=slam.txt&max_gap=2", None, None).poses == "given"
+    tracked = choose_poses(f"{where}?poses=slam.txt", None, "track")
+    assert tracked.source.frame(0).fault is None  # the poses are not read: the image is
+    assert tracked.source.frame(0).depth.size

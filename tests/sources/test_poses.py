@@ -75,3 +75,49 @@ def test_what_is_handed_out_is_not_the_stored_pose():
 def test_arrays_that_do_not_fit_are_an_error(stamps, T, confidence):
     with pytest.raises(SourceError, match="t265"):
         Poses(stamps, T, confidence, where="t265")
+
+
+def accelerated(step_ns, accel, count=7):
+    """Poses of a body that accelerates along x and turns faster and faster about z."""
+    t = np.arange(count) * step_ns / 1e9
+    T = at(*(0.4 * t + accel * t**2 / 2))
+    angle = 0.2 * t + accel * t**2 / 2
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(angle)
+    T[:, 1, 0] = np.sin(angle)
+    T[:, 0, 1] = -T[:, 1, 0]
+    return Poses(np.arange(count) * step_ns, T)
+
+
+@pytest.mark.parametrize(("accel", "near"), [(0.0, True), (0.5, True), (1.9, True), (2.1, False), (9.0, False)])
+def test_poses_at_5_hz_are_bridged_if_the_motion_is_smooth(accel, near):
+    """A parabola is off its chord by a g^2 / 8 in the middle: 1 cm at 2 m/s^2 and 0.2 s."""
+    poses, stamp_ns = accelerated(200 * MS, accel), 630 * MS
+    if near:
+        x = 0.4 * 0.63 + accel * 0.63**2 / 2
+        assert abs(poses.at(stamp_ns)[0, 3] - x) < 0.01
+        assert abs(poses.at(stamp_ns)[0, 3] - x) > 0.3 * accel * 0.2**2 / 8 - 1e-12
+    else:
+        with pytest.raises(FrameRefused, match=r"0\.1 s"):
+            poses.at(stamp_ns)
+        poses.max_gap_ns = 200 * MS
+        assert poses.at(stamp_ns) is not None
+        poses.max_gap_ns = 199 * MS
+        with pytest.raises(FrameRefused):
+            poses.at(stamp_ns)
+
+
+def test_a_loss_in_dense_poses_is_not_bridged():
+    """Poses every 20 ms that are missing for 0.3 s: a tracker lost its world, however smooth the rest is."""
+    dense = accelerated(20 * MS, 0.0, 60)
+    keep = (dense.stamps_ns <= 400 * MS) | (dense.stamps_ns >= 700 * MS)
+    with pytest.raises(FrameRefused):
+        Poses(dense.stamps_ns[keep], dense.T_world_body[keep]).at(550 * MS)
+
+
+def test_a_jump_next_to_the_gap_is_not_smooth():
+    poses = accelerated(200 * MS, 0.0)
+    poses.T_world_body[4:, 0, 3] += 0.3
+    assert poses.at(300 * MS) is not None
+    for stamp_ns in (500 * MS, 700 * MS, 900 * MS):
+        with pytest.raises(FrameRefused):
+            poses.at(stamp_ns)

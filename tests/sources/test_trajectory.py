@@ -85,7 +85,7 @@ def test_there_is_no_pose_before_the_first_and_after_the_last(trajectory, stamp,
 
 
 def test_both_neighbours_must_be_near(trajectory):
-    poses = trajectory("10.0 0 0 0 0 0 0 1\n10.15 1 0 0 0 0 0 1\n10.30 2 0 0 0 0 0 1\n")
+    poses = trajectory("10.0 0 0 0 0 0 0 1\n10.15 1 0 0 0 0 0 1\n10.30 5 0 0 0 0 0 1\n")
     assert poses.at(ns_from_seconds("10.06"))[0, 3] == pytest.approx(0.4)
     assert refusal(poses, ns_from_seconds("10.04"))[0] == "no_pose"  # 0.11 s to the one after
     reason, message = refusal(poses, ns_from_seconds("10.11"))

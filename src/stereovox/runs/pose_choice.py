@@ -11,7 +11,7 @@ import numpy as np
 from stereovox import opening
 from stereovox.config import Config, load_config
 from stereovox.config.safety import TrustConfig
-from stereovox.errors import NoPoses, StereovoxError, did_you_mean
+from stereovox.errors import NoPoses, StereovoxError, did_you_mean, shortened
 from stereovox.sources.base import Source, Stream, stream_of
 from stereovox.track.tracker import POSE_FAULTS
 
@@ -20,6 +20,8 @@ CHOICES = (GIVEN, TRACK, BOTH)
 HOW = {TRACK: "tracked", BOTH: "corrected"}
 """Suffix of a recording's name by the poses used, unless they are its own."""
 NOT_COMPARED = "scans are not compared with the map, since {why}; set trust.max_disagreement=0.2 to compare them"
+MAX_WHY = 150
+"""Longest reason that a message repeats."""
 INSPECTED = 10
 """Frames, spread over a recording, that are inspected; if none has a pose, the recording counts as having none."""
 
@@ -68,6 +70,8 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
         if poses is not None:
             raise
         return Choice(opening.open_images(source, frames), TRACK, str(error))
+    if chosen.poses == TRACK and poses is None and "poses=" in str(source).partition("?")[2]:
+        raise StereovoxError(f"{chosen.why}; correct ?poses=, or give --poses track")  # named, and yet not used
     if chosen.poses != TRACK or chosen.source.length is None:  # a live camera is opened once
         return chosen
     return chosen._replace(source=opening.open_images(source, frames))
@@ -97,12 +101,14 @@ def _missing(source: Stream) -> str:
     """Return why a source has no poses, empty if it has some."""
     if not isinstance(source, Source) or not len(source):
         return "" if source.posed else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
-    unposed = False
+    faults = list[str]()
     for i in np.unique(np.linspace(0, len(source) - 1, min(INSPECTED, len(source))).astype(int)).tolist():
         frame = source.frame(i)
         if frame.fault is None and np.isfinite(frame.T_world_sensor).all():
             return ""
-        unposed |= frame.fault is None or frame.fault in POSE_FAULTS
-    if not unposed:
+        if frame.fault is None or frame.fault in POSE_FAULTS:
+            faults.append("" if frame.fault is None else frame.fault_detail)
+    if not faults:
         return ""
-    return f"{source.name}: none of the frames inspected has a pose"
+    why = shortened(faults[len(faults) // 2], MAX_WHY)
+    return f"{source.name}: none of the frames inspected has a pose{f' ({why})' if why else ''}"

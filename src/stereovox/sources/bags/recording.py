@@ -45,6 +45,7 @@ class Options:
     pose: `fixed` for a static camera: every pose is the identity, and poses in the file are ignored.
     imu: topic of the IMU (`sensor_msgs/Imu`), if there are several; `off` for none.
     scale: metres per unit (0: the file's, else millimetres); baseline: metres (0: the file's).
+    max_gap: longest gap in seconds between poses that is bridged (0: 0.5 in /tf, else as smooth motion allows).
     """
 
     depth: str = ""
@@ -57,6 +58,7 @@ class Options:
     imu: str = ""
     scale: float = 0.0
     baseline: float = 0.0
+    max_gap: float = 0.0
 
     def __post_init__(self) -> None:
         for key, known in {"axes": tuple(AXES), "world": WORLDS, "pose": STANDING}.items():
@@ -67,7 +69,7 @@ class Options:
             for key in filter(lambda key, one=one: getattr(self, one) and getattr(self, key), others):
                 told = f"{one}={getattr(self, one)} and {key}={getattr(self, key)}"
                 raise SourceError(f"{told} contradict each other; give one")
-        for key in ("scale", "baseline"):
+        for key in ("scale", "baseline", "max_gap"):
             if getattr(self, key) < 0:
                 raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
 
@@ -247,7 +249,7 @@ def read_poses(
     if options.poses not in file.types and (path := _file_of(options.poses, file.path)):
         poses, axes = poses_of_images(path, sensor.stamps_ns()), options.axes or "optical"
         T = turned(poses.T_world_body, axes, options.world or "file")
-        return Poses(poses.stamps_ns, T, where=poses.where, faults=poses.faults), "", ()
+        return _limited(Poses(poses.stamps_ns, T, where=poses.where, faults=poses.faults), options), "", ()
     chained = bool(sensor.option) and not options.axes
     found = find_poses(file, options.poses, sensor.frame_id, options.world_frame, chained)
     if found.unmounted:
@@ -259,9 +261,17 @@ def read_poses(
     poses = found.poses
     notes = () if found.of_camera or options.axes else (found.assumed,)
     if isinstance(poses, TfPoses):
+        if options.max_gap:
+            poses.tf.limits = replace(poses.tf.limits, max_gap_s=options.max_gap)
         return TurnedTf(poses, axes, world), "", (*notes, *poses.tf.notes)
     T = turned(poses.T_world_body, axes, world)
-    return Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults), "", notes
+    made = Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults)
+    return _limited(made, options), "", notes
+
+
+def _limited(poses: Poses, options: Options) -> Poses:
+    poses.max_gap_ns = round(options.max_gap * 1e9)
+    return poses
 
 
 def _file_of(text: str, bag: Path) -> Path | None:

@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.geometry.se3 import Transform, interpolate
+from stereovox.geometry.se3 import Transform, interpolate, inverse, rotation_vector
 
 MAX_GAP_NS = 100_000_000
-"""An image whose neighbouring poses are 0.1 s or more away, on either side, has no pose."""
+"""An image whose neighbouring poses are 0.1 s or more away, on either side, has no pose, unless motion is smooth."""
+SMOOTH_GAP_NS, USUAL, OFF_M, OFF_RAD = 1_000_000_000, 1.5, 0.01, 0.01
+"""Longest time between two poses that is bridged if it is usual (at most 1.5 times the median: a longer one is a loss)
+and the motion smooth: if the poses before and after show an acceleration that puts the middle of the gap off its line
+by less than 1 cm and 0.01 rad."""
 
 
 class Poses:
@@ -27,6 +31,7 @@ class Poses:
     where: origin of the poses, for messages: a file or topic.
     faults: why poses are unusable, by stamp; one line each with the cure.
     repeated: number of poses left out because an earlier one has the same stamp.
+    max_gap_ns: longest time between neighbours that is bridged, however the body moves; 0: by the two rules above.
     Raises SourceError if there is no pose or the arrays do not fit together.
     """
 
@@ -51,6 +56,8 @@ class Poses:
         self.confidence = None if confidence is None else trust[first]
         self.where = where
         self.faults = dict(faults or {})
+        self.max_gap_ns = 0
+        self._interval_ns = float(np.median(np.diff(self.stamps_ns))) if len(first) > 1 else 0.0
         self._stamps: list[int] = self.stamps_ns.tolist()
 
     def __len__(self) -> int:
@@ -60,8 +67,8 @@ class Poses:
         """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between its neighbours.
 
         Straight line in position, constant turn rate in rotation.
-        Raises FrameRefused: `no_pose` if one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
-        if a neighbour is unusable.
+        Raises FrameRefused: `no_pose` if one of the neighbours is missing, or too far away (`MAX_GAP_NS`),
+        `bad_pose_file` if a neighbour is unusable.
         """
         before, after = self.neighbours(stamp_ns)
         if before == after:
@@ -72,7 +79,7 @@ class Poses:
     def neighbours(self, stamp_ns: int) -> tuple[int, int]:
         """Return the numbers of the poses before and after `stamp_ns`, twice the same if one has exactly that time.
 
-        Raises FrameRefused `no_pose` if one of them is missing or 0.1 s or more away.
+        Raises FrameRefused `no_pose` if one of them is missing or too far away.
         """
         stamp_ns = int(stamp_ns)
         after = bisect_left(self._stamps, stamp_ns)
@@ -86,11 +93,40 @@ class Poses:
             "before": stamp_ns - self._stamps[after - 1] if after else None,
             "after": self._stamps[after] - stamp_ns if after < len(self._stamps) else None,
         }
+        if 0 < after < len(self._stamps) and self._bridged(after):
+            return
         for side, gap in gaps.items():
             if gap is None or gap >= MAX_GAP_NS:
                 found = "there is none" if gap is None else f"the nearest is {gap / 1e9:.3f} s away"
                 wanted = f"needs a pose less than {MAX_GAP_NS / 1e9:g} s {side} {stamp_ns / 1e9:.3f} s"
                 raise FrameRefused("no_pose", f"{self.where}: {wanted}, {found}; leave the image out or add poses")
+
+    def _bridged(self, after: int) -> bool:
+        """Return whether the time before pose `after` may be bridged although it may be long."""
+        gap = self._stamps[after] - self._stamps[after - 1]
+        if self.max_gap_ns:
+            return gap <= self.max_gap_ns
+        ends = [k for k in (after - 1, after) if 0 < k < len(self._stamps) - 1]
+        return (
+            gap <= min(SMOOTH_GAP_NS, USUAL * self._interval_ns)
+            and bool(ends)
+            and all(self._off(k, gap) < 1 for k in ends)
+        )
+
+    def _off(self, k: int, gap: int) -> float:
+        """Return how far the middle of a gap next to pose `k` may be off its line, as a share of what is allowed.
+
+        At constant acceleration pose k is off the line of its neighbours by a h g / 2, for h seconds to the one and g,
+        the gap, to the other; the middle of the gap is off by a g^2 / 8.
+        """
+        start, here, end = self._stamps[k - 1 : k + 2]
+        other = end - start - gap
+        if other > SMOOTH_GAP_NS or not np.isfinite(self.T_world_body[k - 1 : k + 2]).all():
+            return np.inf
+        line = interpolate(self.T_world_body[k - 1], self.T_world_body[k + 1], (here - start) / (end - start))
+        T = inverse(line) @ self.T_world_body[k]
+        place, turn = np.linalg.norm(T[:3, 3]) / OFF_M, np.linalg.norm(rotation_vector(T[:3, :3])) / OFF_RAD
+        return float(max(place, turn)) * gap / (4 * other)
 
     def _pose(self, k: int) -> NDArray[np.float64]:
         T = self.T_world_body[k]

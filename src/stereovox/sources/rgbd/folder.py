@@ -58,7 +58,8 @@ class FolderOptions:
     camera: file of the camera, instead of the layout's own. fps: images a second if they have no times (0: the
     layout's). poses: file or folder of poses, of any form, instead of the layout's own. axes: axes of the posed
     camera, `optical`, `opengl` (x right, y up, z backward), `ros` or `ned`. invert: whether poses are world to camera.
-    poses_scale: metres per unit of the poses' positions (0.001: millimetres).
+    poses_scale: metres per unit of the poses' positions (0.001: millimetres). max_gap: longest gap in seconds between
+    poses that is bridged (0: 0.1 on either side, or as smooth motion allows).
     """
 
     depth_scale: float = 0.0
@@ -68,11 +69,12 @@ class FolderOptions:
     axes: str = ""
     invert: bool = False
     poses_scale: float = 1.0
+    max_gap: float = 0.0
 
     def __post_init__(self) -> None:
         if self.axes and self.axes not in AXES:
             raise SourceError(f"axes={self.axes} is unknown{did_you_mean(self.axes, AXES)}")
-        for key in ("depth_scale", "fps"):
+        for key in ("depth_scale", "fps", "max_gap"):
             if getattr(self, key) < 0:
                 raise SourceError(f"{key}={getattr(self, key):g} must be positive")
         if not self.poses_scale > 0:
@@ -280,9 +282,11 @@ class DepthFolder(DepthSource, ABC):
         return replace(frame, photo=self.photo(i))
 
     def _read_poses(self) -> Poses | ImagePoses | None:
-        if not self.options.poses:
-            return self.read_poses()
-        return self.fitted(read_poses(self._file(self.options.poses)))
+        named = self.options.poses
+        found = self.fitted(read_poses(self._file(named))) if named else self.read_poses()
+        if isinstance(found, Poses):
+            found.max_gap_ns = round(self.options.max_gap * SECOND)
+        return found
 
     def fitted(self, found: Poses | ImagePoses) -> Poses | ImagePoses:
         """Assign poses to the images: by number, by time, or one for each in order.

@@ -94,7 +94,7 @@ class TumRgbd(StampedImages):
     Without it, if depth.txt or associations.txt lists the images or their names are times, the poses of a SLAM program
     (`CameraTrajectory.txt` and the like), with a note. World: the poses' (TUM's motion capture: z up).
     Pose: interpolated between the neighbours of the image's time, linear in position and rotation angle; both must
-    be less than 0.1 s away. Further faults: those of `Poses.at`.
+    be less than 0.1 s away, or the motion smooth. Further faults: those of `Poses.at`.
     """
 
     layout = "a TUM RGB-D folder (depth.txt or depth/*.png, with groundtruth.txt)"
@@ -126,7 +126,7 @@ class TumRgbd(StampedImages):
     @classmethod
     def depth_only(cls, where: str) -> StampedImages:
         """Return the images without searching for poses: every pose is NaN."""
-        return StampedImages(where)
+        return StampedImages(where, posed=False)
 
 
 def _posed(where: str) -> bool:

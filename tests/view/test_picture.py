@@ -118,6 +118,24 @@ def test_the_ceiling_is_cut_away_and_a_landscape_is_not():
     assert ceiling(hill) == 10
 
 
+def cave(slope):
+    """A tunnel 30 cells wide and 20 high that climbs to a level hall, closed all round."""
+    ground = np.concatenate([np.arange(0, 200) * slope, np.full(120, 200 * slope)]).astype(int)
+    return np.array([
+        [x, y, low + z] for x, low in enumerate(ground) for y in range(30) for z in range(21)
+        if y in (0, 29) or z in (0, 20)
+    ])  # fmt: skip
+
+
+def test_the_ground_of_a_sloping_cave_is_not_cut_off_as_a_ceiling():
+    """Cut at one height, the picture of a real cave lacked 63 % of the cells."""
+    drawn = upright(VoxelMap.from_cells(CONFIG, cave(0.3), [3.0] * len(cave(0.3))), None, "z")
+    assert drawn.cut is None
+    level = upright(VoxelMap.from_cells(CONFIG, cave(0.0), [3.0] * len(cave(0.0))), None, "z")
+    assert level.cut == pytest.approx(1.9)
+    assert level.below_ceiling[:, 2].max() == 18
+
+
 def test_reflections_far_below_make_no_ceiling_of_a_street():
     road = np.array([[x, y, -x // 100] for x in range(200) for y in range(30)])
     fronts = np.array([[x, y, z] for x in range(200) for y in (0, 29) for z in range(1, 10)])

@@ -10,6 +10,8 @@ UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1
 """For each up axis: the map's axes that point right, away and up in a picture (the last flipped if minus)."""
 SLAB = 1.6
 """A layer with this many times the cells of the median layer is a floor or a ceiling."""
+SPOT, COVERS = 3, 0.7
+"""Squares of 8 cells are spots of the ground; a ceiling has at least this share of its cells above others."""
 STRAY = 0.005
 """This share of the cells at the bottom, and at the top, is ignored as reflections."""
 
@@ -32,7 +34,7 @@ def ceiling(occupied: NDArray[np.int32]) -> int:
     """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
 
     A ceiling is a layer in the upper part of the map, with and without its stray cells, with far more cells than
-    usual layers.
+    usual layers. Most of the cells from there up must be above others: on a slope the ground of the upper part is not.
     """
     if not len(occupied):
         return 0
@@ -40,7 +42,12 @@ def ceiling(occupied: NDArray[np.int32]) -> int:
     first, end = usual_layers(count)
     upper = np.arange(len(count)) > max(0.55 * len(count), first + 0.55 * (end - first))
     slabs = np.flatnonzero(upper & (count > SLAB * np.median(count[first:end])))
-    return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
+    cut = int(low + (slabs[0] - 1 if len(slabs) else len(count)))
+    spots = occupied[:, :2] >> SPOT
+    spots = (spots[:, 0].astype(np.int64) << 32) + spots[:, 1]
+    above = occupied[:, 2] >= cut
+    covers = np.isin(spots[above], spots[~above])
+    return cut if covers.sum() >= COVERS * len(covers) else int(low + len(count))
 
 
 def usual_layers(count: NDArray[np.int64]) -> tuple[int, int]:

@@ -25,7 +25,7 @@ from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import kind_of
 from stereovox.sources.base import parse_slice as parse_slice
-from stereovox.sources.foreign_files import cure_of
+from stereovox.sources.foreign_files import POINTS, cure_of, is_pointer
 from stereovox.sources.latest import LatestStream
 from stereovox.sources.paced import Paced
 from stereovox.sources.rgbd.folder import folder_part
@@ -79,6 +79,8 @@ ROBOTS = {
 """Recordings of ground robots, asked in this order, after those of other packages (entry points `stereovox.robots`)."""
 
 
+BAGS = (".db3", ".mcap")
+"""Endings of files in a rosbag2 folder."""
 AMBIGUOUS = (".txt", ".csv", ".bin")
 """Endings of clouds that may be anything else: poses, a camera."""
 MAX_BELOW, MAX_LISTED = 50, 10_000
@@ -267,6 +269,8 @@ def _open(kind: Any, where: str) -> Any:
 
 def _recognise(where: str) -> Any:
     kinds = []
+    if is_pointer(where.partition("?")[0]):
+        raise SourceError(f"{shortened(where)}: {POINTS}")
     for kind in _classes():
         kinds.append(kind)
         if kind.recognises(where):
@@ -287,7 +291,10 @@ def _inner(place: str, kinds: list[Any]) -> str:
     if likely:
         return f"no recording itself; did you mean {likely}?"
     likely = next((folder for folder in below if os.path.isfile(os.path.join(folder, "manifest.json"))), None)
-    return f"no recording, but it holds a map (did you mean {likely}?)" if likely else ""
+    if likely:
+        return f"no recording, but it holds a map (did you mean {likely}?)"
+    files = sorted(entry.path for entry in os.scandir(place) if entry.name.endswith(BAGS))
+    return f"no recording itself (metadata.yaml is missing); did you mean {files[0]}?" if files else ""
 
 
 def _problem(where: str, kinds: list[Any]) -> str:

@@ -12,6 +12,7 @@ from stereovox.cli import main
 from stereovox.errors import MapFileError
 from stereovox.formats import import_map
 from stereovox.formats.map_server import read_map_server, write_map_server
+from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 
 WILLOW = Path(__file__).resolve().parents[2] / "../shared/data/map_server/willow-2010-02-18-0.10.yaml"
@@ -341,3 +342,17 @@ def test_the_willow_map_comes_back_cell_for_cell(tmp_path, mode):
     assert dict(zip(*np.unique(grid.cells, return_counts=True), strict=True)) == {-1: 234377, 0: 109207, 100: 544}
     write_map_server(grid, tmp_path / "map.yaml", mode)
     np.testing.assert_array_equal(read_map_server(tmp_path / "map.yaml").cells, grid.cells)
+
+
+@pytest.mark.parametrize("image", ["/home/robot/maps/floor.pgm", "~/maps/floor.pgm", "C:\\maps\\floor.pgm"])
+def test_a_map_that_was_copied_finds_its_picture(tmp_path, image):
+    """The saver wrote the path of the picture on the robot."""
+    Image.fromarray(np.array([[0, 254], [205, 254]], np.uint8)).save(tmp_path / "floor.pgm")
+    lines = ["resolution: 0.05", "origin: [0, 0, 0]", "negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196"]
+    (tmp_path / "floor.yaml").write_text("\n".join([f"image: {image}", *lines]))
+    assert (
+        read_map_server(tmp_path / "floor.yaml").states == [[State.UNKNOWN, State.FREE], [State.OCCUPIED, State.FREE]]
+    ).all()
+    (tmp_path / "floor.pgm").unlink()
+    with pytest.raises(MapFileError, match="no such picture"):
+        read_map_server(tmp_path / "floor.yaml")

@@ -5,9 +5,10 @@ import shlex
 
 import pytest
 
+from stereovox.descriptions import describe
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.foreign_files import CURES, cure_of
+from stereovox.sources.foreign_files import CURES, POINTER, cure_of
 
 CLOUDS = ".ply", ".pcd", ".las", ".bt", ".e57", ".svox"
 
@@ -51,3 +52,18 @@ def test_pointers_of_git_lfs_name_the_command(tmp_path):
     (tmp_path / "scan/poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(SourceError, match="git lfs pull"):
         open_source(tmp_path / "scan")
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.sens", "a.klg", "poses.txt", "a.db3", "a.json"])
+def test_a_pointer_is_named_whatever_the_ending(tmp_path, name):
+    (tmp_path / name).write_bytes(POINTER + b".github.com/spec/v1\noid sha256:4d\nsize 12345\n")
+    for open_it in (describe, open_source):
+        with pytest.raises(SourceError, match="git lfs pull"):
+            open_it(str(tmp_path / name))
+
+
+def test_a_rosbag2_folder_without_its_list_names_its_file(tmp_path):
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk/all.db3").write_bytes(b"SQLite format 3\0")
+    with pytest.raises(SourceError, match=r"metadata\.yaml is missing\); did you mean .*all.db3\?"):
+        open_source(tmp_path / "walk")

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import pytest
 
+from stereovox.descriptions import describe
 from stereovox.errors import SourceError
 from stereovox.sources.calibration.camera_file import find_camera
 from stereovox.sources.calibration.intrinsics import read_camera_numbers, read_intrinsics
@@ -98,3 +99,52 @@ def test_a_matrix_with_a_fourth_column_or_its_last_line_twice(tmp_path):
     for text in ("500 0 320 0\n0 501 240 0\n0 0 1 0\n", "500 0 320\n0 501 240\n0 0 1\n0 0 1\n"):
         (tmp_path / "K.txt").write_text(text)
         assert read_intrinsics(tmp_path / "K.txt") == (500, 501, 320, 240)
+
+
+ECHO = """header:
+  frame_id: camera
+height: 480
+width: 848
+d:
+- 0.0
+k:
+- 421.5
+- 0.0
+- 424.25
+- 0.0
+- 420.5
+- 238.75
+- 0.0
+- 0.0
+- 1.0
+binning_x: 0
+roi:
+  height: 0
+  width: 0
+---
+"""
+
+
+@pytest.mark.parametrize("name", ["camera_info.yaml", "echo.txt"])
+@pytest.mark.parametrize("times", [1, 3])
+def test_what_topic_echo_prints_is_a_camera(tmp_path, name, times):
+    (tmp_path / name).write_text(ECHO * times)
+    assert read_camera_numbers(tmp_path / name)[:2] == ((421.5, 420.5, 424.25, 238.75), (848, 480))
+
+
+SEVERAL = {
+    "SN123.conf": "[LEFT_CAM_2K]\nfx=1065\nfy=1065\ncx=1117\ncy=628\n[LEFT_CAM_HD]\nfx=532\nfy=532\ncx=640\ncy=360\n",
+    "rs.txt": ' Intrinsic of "Depth" / 848x480 / {Z16}\n  Fx: 421\n Intrinsic of "Depth" / 640x480 / {Z16}\n  Fx: 9\n',
+    "oak.json": '{"boardName": "OAK-D", "cameraData": [[1, {"intrinsicMatrix": [[8, 0, 6], [0, 8, 4], [0, 0, 1]]}]]}',
+    "cut.yaml": ECHO.replace("  height: 0\n  width: 0", "  height: 240\n  width: 320"),
+    "binned.yaml": ECHO.replace("binning_x: 0", "binning_x: 2"),
+}
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_a_file_of_several_cameras_is_refused_with_the_cure(tmp_path, name):
+    """The last of a ZED's sizes was taken for that of any image."""
+    (tmp_path / name).write_text(SEVERAL[name])
+    for read in (read_camera_numbers, describe):
+        with pytest.raises(SourceError, match=r"write .* into K\.txt"):
+            read(tmp_path / name)

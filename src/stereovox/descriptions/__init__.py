@@ -10,6 +10,7 @@ from importlib import import_module
 
 from stereovox.descriptions.description import Description as Description
 from stereovox.errors import SourceError, shortened
+from stereovox.sources.foreign_files import POINTS, is_pointer
 
 KINDS = (
     "stereovox.descriptions.maps:describe_map",
@@ -44,6 +45,8 @@ def describe(path: str | os.PathLike[str]) -> Description:
     from stereovox.opening import file_cure, open_source
 
     text = os.fspath(path)
+    if is_pointer(text):
+        raise SourceError(f"{shortened(text)}: {POINTS}")
     found = _known(text, KINDS)
     if found is not None:
         return found

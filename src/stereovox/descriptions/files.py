@@ -17,7 +17,7 @@ from stereovox.sources.rgbd.depth_unit import unit_words
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".bmp", ".webp", ".ppm", ".pgm")
 IMAGE_SUFFIXES = (*SUFFIXES, *PICTURE_SUFFIXES)
 TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".xml", ".csv", ".log", ".tum", ".freiburg",
-                 ".g2o", ".traj")  # fmt: skip
+                 ".g2o", ".traj", ".conf")  # fmt: skip
 LOOSE = (".txt", ".csv", ".bin", ".npz")
 """Endings of clouds and cells that many other files share."""
 SEE = "what each may hold: docs/recordings.md, docs/formats.md"
@@ -101,7 +101,7 @@ def describe_calibration(path: str) -> Description | None:
     if not _is_text(path):
         return None
     from stereovox.sources.calibration.calibration_files import import_rig
-    from stereovox.sources.calibration.intrinsics import read_camera_numbers
+    from stereovox.sources.calibration.intrinsics import SeveralCamerasError, read_camera_numbers
 
     try:
         rig = import_rig([Path(path)])
@@ -115,6 +115,8 @@ def describe_calibration(path: str) -> Description | None:
         stereo = str(error)
     try:
         numbers = read_camera_numbers(Path(path))
+    except SeveralCamerasError:
+        raise
     except (StereovoxError, ValueError):
         return None
     if not all(1 < abs(n) < 1e5 for n in numbers.intrinsics[:2]) or Path(path).suffix == ".csv":

@@ -240,7 +240,13 @@ def _checked(path: Path, fields: dict[Any, Any]) -> Metadata:
         raise MapFileError(f"{path}: resolution {resolution:g}; cells have a side above 0 metres")
     if not 0 <= free < occupied <= 1:
         raise MapFileError(f"{path}: free_thresh {free:g} and occupied_thresh {occupied:g} must rise, from 0 to 1")
-    return Metadata(path.parent / image, resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
+    return Metadata(_image_of(path, image), resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
+
+
+def _image_of(path: Path, image: str) -> Path:
+    """Return the picture that a .yaml names, or that of the same name next to it if both were copied from elsewhere."""
+    named, beside = path.parent / image, path.parent / re.split(r"[/\\]", image)[-1]
+    return beside if not named.is_file() and beside.is_file() else named
 
 
 def _number(path: Path, name: str, value: Any) -> float:

@@ -236,3 +236,30 @@ def test_a_bag_without_depth_tells_what_it_holds(tmp_path):
         bag.add("/infra", "sensor_msgs/Image", START_NS, image(depth(0), "mono16", stamp(0)))
     with pytest.raises(SourceError, match=r"no depth images .*/chatter \(std_msgs/String\)"):
         BagSource(bag.path)
+
+
+def test_the_camera_of_a_cut_and_binned_image(tmp_path):
+    """K is of the whole sensor (CameraInfo.msg): the image begins at the offset, and a pixel is made of 2 x 3."""
+    info = camera_info(64, 48, P=False)
+    info.binning_x, info.binning_y = 2, 3
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 10, 6, 16, 18
+    with Bag(tmp_path / "a.bag") as bag:
+        small = np.full((6, 8), 1500, np.uint16)
+        bag.add("/depth/image", "sensor_msgs/Image", stamp(0), image(small, "16UC1", stamp(0)))
+        bag.add("/depth/camera_info", "sensor_msgs/CameraInfo", stamp(0), info)
+    camera = BagSource(bag.path).camera
+    assert (camera.width, camera.height) == (8, 6)
+    columns = [[10 + 2 * k, 11 + 2 * k] for k in range(8)]  # sensor columns of each pixel: its ray is their middle
+    rays = (np.mean(columns, axis=1) - 3.5) / 10.0
+    np.testing.assert_allclose((np.arange(8) - camera.cx) / camera.fx, rays)
+    rows = [[6 + 3 * k, 7 + 3 * k, 8 + 3 * k] for k in range(6)]
+    np.testing.assert_allclose((np.arange(6) - camera.cy) / camera.fy, (np.mean(rows, axis=1) - 2.5) / 10.5)
+
+
+def test_grey_images_of_16_bits_may_be_depth(tmp_path):
+    with Bag(tmp_path / "a.bag") as bag:
+        bag.add("/depth/image", "sensor_msgs/Image", stamp(0), image(depth(0), "mono16", stamp(0)))
+        bag.add("/depth/camera_info", "sensor_msgs/CameraInfo", stamp(0), camera_info())
+    with pytest.raises(SourceError, match=r"if mono16 is depth here: \?depth=/depth/image"):
+        open_source(bag.path)
+    np.testing.assert_array_equal(open_source(f"{bag.path}?depth=/depth/image").frame(0).depth, depth(0))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from stereovox.sources.bags.messages import (
     read_value,
 )
 from stereovox.sources.bags.robot_messages import CLOUDS
+from stereovox.sources.calibration.intrinsics import scaled
 
 PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 VALUES = ("std_msgs/Float32", "std_msgs/String")
@@ -109,9 +111,19 @@ def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
     if not found:
         seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
         clouds = [f"?cloud={name}" for name, kind in sorted(file.types.items()) if kind in CLOUDS]
-        cure = f"; for its clouds add {' or '.join(clouds)}" if clouds else ""
+        grey = [
+            f"?depth={name}" for name, kind in sorted(file.types.items()) if kind == IMAGE and _is_grey16(file, name)
+        ]
+        cure = f"; if mono16 is depth here: {' or '.join(grey)}" if grey else ""
+        cure += f"; for its clouds add {' or '.join(clouds)}" if clouds else ""
         raise SourceError(f"{file.path}: no depth images ({', '.join(DEPTH)} or {PACKED}) in it; it holds {seen}{cure}")
     return DepthTopic(file, found[0], info)
+
+
+def _is_grey16(file: BagFile, topic: str) -> bool:
+    with suppress(FrameRefused, ValueError):
+        return read_image(file.read(topic, 0)).encoding == "mono16"
+    return False
 
 
 def depth_topics(file: BagFile) -> list[str]:
@@ -196,6 +208,13 @@ def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) 
         raise SourceError(
             "has no focal length (K is zero: the camera was not calibrated); name another with ?info=/topic"
         )
+    left, top, height, width = info.roi
+    if not (width and height):
+        left, top, height, width = 0, 0, info.height, info.width
+    across, down = info.binning
+    if across > 1 or down > 1 or left or top:
+        fx, fy, cx, cy = scaled((fx, fy, cx - left, cy - top), 1 / across, 1 / down)
+    info = replace(info, width=width // across, height=height // down)
     if info.width * info.height > MAX_PIXELS:
         raise SourceError(f"has {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
     return PinholeCamera(info.width, info.height, fx, fy, cx, cy, baseline)

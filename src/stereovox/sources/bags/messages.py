@@ -123,13 +123,19 @@ def read_compressed(wire: Wire) -> Picture:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A `sensor_msgs/CameraInfo`: K (3x3) and P (3x4) row by row, and the distortion coefficients D."""
+    """A `sensor_msgs/CameraInfo`: K (3x3) and P (3x4) row by row, and the distortion coefficients D.
+
+    They are of the whole image; images are cut to roi (x_offset, y_offset, height, width; height and width 0: whole),
+    and of binning pixels along x and y one is made.
+    """
 
     width: int
     height: int
     K: tuple[float, ...]
     D: tuple[float, ...] = ()
     P: tuple[float, ...] = (0.0,) * 12
+    binning: tuple[int, int] = (1, 1)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
 def read_camera_info(wire: Wire) -> CameraInfo:
@@ -142,7 +148,10 @@ def read_camera_info(wire: Wire) -> CameraInfo:
         raise ValueError(f"a lens with {count} coefficients")
     D = wire.numbers("d", count) if count else ()  # aligned only if something follows
     K, _, P = wire.numbers("d", 9), wire.numbers("d", 9), wire.numbers("d", 12)
-    return CameraInfo(width, height, K, D, P)
+    binning, roi = wire.numbers("I", 2), wire.numbers("I", 4)
+    return CameraInfo(
+        width, height, K, D, P, (max(binning[0], 1), max(binning[1], 1)), (roi[0], roi[1], roi[2], roi[3])
+    )
 
 
 @dataclass(frozen=True)

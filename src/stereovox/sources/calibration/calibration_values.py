@@ -68,7 +68,9 @@ def read_yaml(path: Path) -> Table:
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
     try:
         lines = read_text(path, MAX_YAML).splitlines()
-        text = "\n".join(lines[1:] if lines and lines[0].startswith("%YAML") else lines)
+        lines = lines[1:] if lines and lines[0].startswith("%YAML") else lines
+        ends = [n for n, line in enumerate(lines) if n and line.rstrip() == "---"]  # `ros2 topic echo` repeats itself
+        text = "\n".join(lines[: ends[0]] if ends else lines)
         table = yaml_value(UNSPACED.sub(r"\1: ", text.expandtabs(2)), Loader)
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None

@@ -41,6 +41,18 @@ KEYS = {
 """Names of each number in tables, in lower case and without the part before a dot (`Camera.fx`)."""
 
 
+CURES = {
+    "[LEFT_CAM": "a ZED's calibration, one for each size; write fx fy cx cy of your images into K.txt, and name it",
+    'Intrinsic of "': "of rs-enumerate-devices, for all streams; write Fx Fy PPX PPY of yours into K.txt, and name it",
+    '"cameraData"': "an OAK's calibration, one for each camera; write fx fy cx cy of yours into K.txt, and name it",
+}
+"""What text marks files with several cameras, and what to do."""
+
+
+class SeveralCamerasError(SourceError):
+    """A file of cameras, of which only the user knows which."""
+
+
 class CameraNumbers(NamedTuple):
     """Numbers of a camera in a file of another program.
 
@@ -75,13 +87,16 @@ def read_camera_numbers(path: Path) -> CameraNumbers:
         Raises:
             SourceError: One line with the file and the problem.
     """
+    text = _text(path)
+    cure = next((cure for mark, cure in CURES.items() if mark in text), "")
+    if cure:
+        raise SeveralCamerasError(f"{path}: {cure}: ?camera=K.txt")
     if path.suffix.lower() == ".json":
         return _of_table(path, read_json(path))
-    if path.suffix.lower() in (".yaml", ".yml"):
+    if path.suffix.lower() in (".yaml", ".yml") or text.startswith("header:"):
         from stereovox.sources.calibration.calibration_files import read_yaml
 
         return _of_table(path, read_yaml(path))
-    text = _text(path)
     if "=" in text:
         return _of_table(path, dict(_assignments(text)))
     words = next((line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")), [])
@@ -138,6 +153,11 @@ def _of_table(path: Path, table: Any) -> CameraNumbers:
     def value(name: str) -> Any:
         return next((found[key] for key in KEYS[name] if key in found), None)
 
+    roi, binned = table.get("roi") if isinstance(table, dict) else None, found.get("binning_x")
+    if (is_number(binned) and binned > 1) or (isinstance(roi, dict) and roi.get("width")):
+        raise SeveralCamerasError(
+            f"{path}: of binned or cut images; write fx fy cx cy of your images into K.txt instead"
+        )
     four = [value(name) for name in ("fx", "fy", "cx", "cy")]
     size = value("width"), value("height")
     if not all(map(is_number, four)):

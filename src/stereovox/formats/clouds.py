@@ -92,7 +92,7 @@ def read_cloud(path: str | Path) -> PointFile:
         return PointFile(**read_las(path)._asdict())
     if ending in TEXTS:
         xyz, named, scans = read_text_points(path)
-        metres = ((UNITS[named],) * 3, named) if named else None
+        metres = ((UNITS[named], UNITS[named], UNITS[named]), named) if named else None
         return PointFile(xyz, f"{f'PTX, {scans} scans' if scans else 'text'}, {_count(xyz)}", metres=metres)
     if ending == ".bin":
         return _lidar_scan(path)

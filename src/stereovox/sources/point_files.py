@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ PLY_TYPES = {
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 FACES = ("face", "tristrips")
 """Elements of a `.ply` that turn its points into a mesh."""
+ENDIAN: dict[str, Literal["little", "big"]] = {"<": "little", ">": "big"}
 PLY_LENGTHS = ("char", "uchar", "short", "ushort", "int", "uint", "int8", "uint8", "int16", "uint16", "int32", "uint32")
 CHUNK, OPAQUE = 256, 128
 """Splats of a compressed `.ply` that share a box, and least opacity of 255 of a surface: half."""
@@ -233,7 +234,7 @@ def _rows(body: bytes, start: int, order: str, element: _Element) -> tuple[NDArr
             runs[-1] += np.dtype(kind).itemsize * count
             continue
         length, item = map(np.dtype, kind.split())
-        lists.append((length.newbyteorder(order), item.itemsize))
+        lists.append((length, item.itemsize))
         runs.append(0)
     least = sum(runs) + sum(length.itemsize for length, _ in lists)
     if element.number * least > len(body) - start:
@@ -242,12 +243,12 @@ def _rows(body: bytes, start: int, order: str, element: _Element) -> tuple[NDArr
         )
     if not lists:
         return start + runs[0] * np.arange(element.number)[:, None], start + runs[0] * element.number
-    steps = [(length.itemsize, item, "little" if order == "<" else "big") for length, item in lists]
+    steps, endian = [(length.itemsize, item) for length, item in lists], ENDIAN[order]
     offsets = np.empty((element.number, len(runs)), np.int64)
     for row in offsets:
         row[0] = start
         start += runs[0]
-        for k, (width, item, endian) in enumerate(steps):
+        for k, (width, item) in enumerate(steps):
             start += width + item * int.from_bytes(body[start : start + width], endian)
             row[k + 1] = start
             start += runs[k + 1]

@@ -154,7 +154,7 @@ def _of_table(path: Path, table: Any) -> CameraNumbers:
         return next((found[key] for key in KEYS[name] if key in found), None)
 
     roi, binned = table.get("roi") if isinstance(table, dict) else None, found.get("binning_x")
-    if (is_number(binned) and binned > 1) or (isinstance(roi, dict) and roi.get("width")):
+    if (isinstance(binned, int) and binned > 1) or (isinstance(roi, dict) and roi.get("width")):
         raise SeveralCamerasError(
             f"{path}: of binned or cut images; write fx fy cx cy of your images into K.txt instead"
         )

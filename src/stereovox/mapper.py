@@ -148,7 +148,7 @@ class Mapper(Aged):
         if resume is None and self.config.trust.max_disagreement < 1:
             self.map.history.unconfirmed = TRIES
 
-    def add(self, frame: AnyFrame | Range) -> UpdateReport:
+    def add(self, frame: AnyFrame) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
         Args:
@@ -213,7 +213,7 @@ class Mapper(Aged):
         with self._correcting:
             return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
-    def expect(self, frame: AnyFrame | Range) -> None:
+    def expect(self, frame: AnyFrame) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.
 
         Call it before `add` of the frame before; the map is the same without. Nothing happens with one thread
@@ -304,7 +304,7 @@ class GridMapper(Aged):
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = FloorComparison(self.config, self._intake.gate, isinstance(resume, OccupancyGrid))
 
-    def add(self, frame: Scan | AnyFrame | Range) -> UpdateReport:
+    def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
 
         Args:

@@ -197,6 +197,11 @@ def test_a_sonar_at_rest_makes_no_wall_of_its_arc_however_often_it_hears_it(nois
     assert (ours[more] > theirs[more]).all()
     assert (theirs[more] <= mapper.map.storage.rules.thresholds.free_most).all()
     assert (mapper.map.frames, mapper.health().state) == (300, "current")
+    arc = [[1.45, 0.05, 0.55], [1.45, 0.15, 0.65]]
+    assert (once.map.state(arc) == sv.State.TENTATIVE).all()
+    free, prior = once.map.log_odds([[1.0, 0.05, 0.55]]), once.map.config.map.prior
+    assert (once.map.log_odds(arc) > np.log(prior / (1 - prior))).all()
+    assert free < np.log(prior / (1 - prior))
     assert (mapper.map.state([[x, 0.05, 0.55] for x in (1.75, 2.0, 3.0)]) == sv.State.UNKNOWN).all()
 
 

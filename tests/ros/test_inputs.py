@@ -13,7 +13,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.mapper import GridMapper, Mapper
-from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, RaysInput, ScanInput
+from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, RangeInput, RaysInput, ScanInput
 from stereovox.ros.poses.poses import Pose
 from stereovox.sources.bags.writer_messages import packed_png
 from stereovox.sources.clouds.options import LidarOptions
@@ -182,6 +182,41 @@ def test_a_scan_enters_a_3d_map_as_rays():
     ahead = T[:3, 3] + [[4.0, 0, 0], [1.2 * np.cos(-0.5), 1.2 * np.sin(-0.5), 0]]
     assert mapper.map.state(ahead).tolist() == [1, 1]
     assert RaysInput("/scan", LidarOptions()).frame(b"\0\1\0\0", there).fault == "unreadable"
+
+
+def range_message(distance: float, stamp_ns: int = 5, **other) -> bytes:
+    fields = {"radiation_type": 0, "field_of_view": 0.3, "min_range": 0.2, "max_range": 4.0, "variance": 0.0025} | other
+    head = wire.header(stamp_ns, "sonar")
+    return wire.packed(wire.made("sensor_msgs/msg/Range", header=head, range=distance, **fields))
+
+
+@pytest.mark.parametrize("mapper", [Mapper("default", voxel_size=0.2), GridMapper("ist2019")], ids=["space", "floor"])
+def test_a_range_enters_maps_as_a_cone(mapper):
+    one = RangeInput("/sonar")
+    for k in range(6):
+        seen = one.frame(range_message(2.1, 10**9 + k * 10**8), lambda name, _, k=k: Pose(moved(k), np.eye(4), 7))
+        assert (seen.distance, seen.beam.beam) == (pytest.approx(2.1), pytest.approx(0.3))
+        assert (seen.sensor, seen.pose_off_ns) == ("/sonar", 7)
+        assert seen.beam.sigma == pytest.approx(0.05)
+        assert mapper.add(seen).refused is None
+    places = T[:3, 3] + [[1.1, 0.0, 0.1], [2.095, 0.0, 0.01], [3.1, 0.0, 0.1], [0.0, 1.0, 0.1]]
+    rules = mapper.map.storage.rules
+    numbers = mapper.map.log_odds(places[:, : mapper.config.dimensions])
+    free, arc = numbers[:2] - rules.prior_log_odds
+    assert free < -0.5
+    assert 0 < arc < 0.7
+    assert numbers[2:].tolist() == [0, 0]  # unknown
+    assert mapper.add(one.frame(range_message(4.0, 2 * 10**9), there)).refused == "no_valid_range"  # silence
+    assert mapper.add(RangeInput("/s", True).frame(range_message(4.0, 3 * 10**9), there)).refused is None
+    for bad in ({"field_of_view": -1.0}, {"min_range": 5.0}, {"max_range": np.nan}):
+        assert mapper.add(one.frame(range_message(1.0, **bad), there)).refused == "unreadable"
+    assert one.frame(range_message(1.0)[:30], there).fault == "unreadable"
+
+
+def moved(k: int) -> np.ndarray:
+    place = T.copy()
+    place[1, 3] += 0.01 * k
+    return place
 
 
 @pytest.mark.parametrize("make", [lambda: CloudInput("/p", Lidar()), lambda: FloorCloudInput("/p")])

@@ -37,7 +37,11 @@ def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
     )
     grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.1)
     health = SimpleNamespace(state="current", text="current", as_dict=dict)
-    mapping = SimpleNamespace(config=load_config(), grid=lambda: grid, health=lambda: health, snapshot=lambda: None)
+    asked: list[bool] = []
+    mapping = SimpleNamespace(
+        config=load_config(), grid=lambda last=False: asked.append(last) or grid, health=lambda: health,
+        snapshot=lambda: None,
+    )  # fmt: skip
     times = [100.0]
     outputs = Outputs(node, mapping, Options(map_rate=30.0), dict, lambda: times[0])
     publishers[MAP].heard = heard
@@ -51,6 +55,9 @@ def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
     assert len(publishers["/diagnostics"].sent) in (2, 3)
     outputs.close()
     assert publishers[MAP].sent[-1].header.stamp.nanosec == 59
+    if heard == 0:  # a map is left over for the end, whose floor is found anew
+        assert asked[-1]
+    assert not any(asked[:-1])
 
 
 def test_messages_carry_frame_and_time_and_clouds_only_occupied_cells():
@@ -74,7 +81,9 @@ def test_a_map_that_no_second_frame_has_confirmed_is_not_published(monkeypatch):
     )
     health = SimpleNamespace(state="waiting", text="waiting", as_dict=dict)
     grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.1)
-    mapping = SimpleNamespace(config=load_config(), grid=lambda: grid, health=lambda: health, snapshot=lambda: None)
+    mapping = SimpleNamespace(
+        config=load_config(), grid=lambda last: grid, health=lambda: health, snapshot=lambda: None
+    )
     outputs = Outputs(node, mapping, Options(), dict, lambda: 100.0)
     outputs.changed(1, "map")
     outputs.update()

@@ -11,7 +11,7 @@ from stereovox.depth.quality import check_depth, check_light
 from stereovox.depth.sphere.image import through_sphere
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, Cloud, DepthImage, Frame, StereoFrame, name_of
+from stereovox.frame import AnyFrame, DepthImage, Frame, Rays, StereoFrame, name_of
 from stereovox.frame.validate import validate_fields
 
 
@@ -29,9 +29,9 @@ class DepthPipeline:
         """
         if isinstance(frame, Frame):
             return frame  # `prepare` validates its fields
-        if isinstance(frame, Cloud):
-            validate_fields(frame, Cloud)
-            detail = "is a cloud, not an image: it can be mapped with given poses, but not tracked"
+        if isinstance(frame, Rays):
+            validate_fields(frame, type(frame))
+            detail = "is no image: it can be mapped with given poses, but not tracked"
             raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
         validate_fields(frame, StereoFrame, Frame)
         assert isinstance(frame, StereoFrame)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import Cloud, Range, name_of
+from stereovox.frame import Cloud, Range, Rays, name_of
 from stereovox.frame.validate import rigid_pose, validate_fields
 from stereovox.sensors.model import REACH_SIGMA
 
@@ -22,14 +22,17 @@ MOST = 1 << 18
 GOLDEN = pi * (3 - sqrt(5))
 
 
-def cloud_of(seen: Range, config: Config) -> Cloud:
-    """Return the rays of a cone: to its arc at the distance, or free ones up to where nothing was heard.
+def cloud_of(seen: Rays, config: Config) -> Cloud:
+    """Return the rays of a cone: to its arc at the distance, or free ones up to where nothing was heard; a cloud as it
+    is.
 
     Rays instead of an integrator of its own: limits, noise, cells, threads and all checks are those of clouds, whose
     kernel already lets a cell that holds an end outweigh whatever passes it.
 
     Raises FrameRefused as `distance_of`.
     """
+    if isinstance(seen, Cloud):
+        return seen
     distance, beam = distance_of(seen), seen.beam
     silent = distance == inf
     end = max(beam.range_max - REACH_SIGMA * beam.sigma, 0.0) if silent else distance

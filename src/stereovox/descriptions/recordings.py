@@ -30,7 +30,8 @@ from stereovox.track.tracker import POSE_FAULTS
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
-IN_WORDS = {"depth": "depth image", "stereo": "stereo pair", "cloud": "cloud"}
+IN_WORDS = {"depth": "depth image", "stereo": "stereo pair", "cloud": "cloud", "range": "range"}
+WITHOUT_IMAGES = {"cloud": "points", "range": "ranges"}
 """Kinds of frames in words."""
 MAX_RATE_HZ = 2000.0
 """Frames a second beyond which the stamps of a recording are wrong."""
@@ -129,7 +130,7 @@ def _survey_lines(found: Survey) -> list[str]:
     about = (
         f"camera: fx {camera.fx:.5g}, fy {camera.fy:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}, baseline {baseline}"
     )
-    if found.kind == "cloud":
+    if found.kind in WITHOUT_IMAGES:
         lines = [f"{found.name}: {frames}{when}"]
     else:
         lines = [f"{found.name}: {frames} of {camera.width}x{camera.height}{when}", about]
@@ -141,7 +142,7 @@ def _survey_lines(found: Survey) -> list[str]:
         near, middle, far = found.depth_m
         lines.append(
             f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half of them below {middle:.2f} m; "
-            f"{100 * found.without_value:.0f} % of the {'points' if found.kind == 'cloud' else 'pixels'} have none"
+            f"{100 * found.without_value:.0f} % of the {WITHOUT_IMAGES.get(found.kind, 'pixels')} have none"
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():

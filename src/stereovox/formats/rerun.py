@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth import DepthPipeline
 from stereovox.depth.cloud import checked_cloud
+from stereovox.depth.ranges import cloud_of
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.files.safe_io import replacing
 from stereovox.formats.points import cell_colours
-from stereovox.frame import AnyFrame, CheckedCloud, Cloud, DepthImage
+from stereovox.frame import AnyFrame, CheckedCloud, DepthImage, Rays
 from stereovox.geometry.se3 import Transform
 from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
@@ -143,8 +144,8 @@ class RerunLog:
         """Log a frame that was offered to the map, between two frames."""
         start = monotonic()
         try:
-            if isinstance(frame, Cloud):
-                self._file.add_cloud(checked_cloud(frame, voxel_map.config))
+            if isinstance(frame, Rays):
+                self._file.add_cloud(checked_cloud(cloud_of(frame, voxel_map.config), voxel_map.config))
             else:
                 self._file.add_depth(self._depth.image(self._depth.matched(frame)))
         except FrameRefused:

@@ -317,14 +317,16 @@ class Range:
     pose_sigma: tuple[float, float] = (0.0, 0.0)
 
 
-AnyFrame = Frame | StereoFrame | Cloud
+Rays = Cloud | Range
+"""Frames of sensors that measure along rays, with their x axis forward and z up."""
+AnyFrame = Frame | StereoFrame | Rays
 """What a source delivers and a mapper takes."""
 
 
 CALLED = {Scan: "scan", Cloud: "cloud", Range: "range"}
 
 
-def name_of(seen: AnyFrame | Scan | Range) -> str:
+def name_of(seen: AnyFrame | Scan) -> str:
     """Return the name of a frame or scan for messages."""
     kind = next((word for one, word in CALLED.items() if isinstance(seen, one)), "frame")
     return seen.name or f"{kind} at {seen.stamp_ns} ns"

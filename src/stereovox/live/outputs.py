@@ -21,7 +21,7 @@ from stereovox.depth.sphere.vehicle import together
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.files.safe_io import FLOOR_ENDINGS, check_file
 from stereovox.formats.map_server import write_map_server
-from stereovox.frame import Cloud, UpdateReport
+from stereovox.frame import Rays, UpdateReport
 from stereovox.geometry.se3 import Transform, inverse
 from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
@@ -178,7 +178,7 @@ class LiveSphere:
 
     def after(self, frame: Any, report: UpdateReport) -> None:
         """Accumulate the image of a camera, unless the map refused it; lidar clouds are skipped."""
-        if report.refused or isinstance(frame, Cloud):
+        if report.refused or isinstance(frame, Rays):
             return
         try:
             image = self._pipeline.checked(self._pipeline.matched(frame))

@@ -20,7 +20,7 @@ import numpy as np
 from stereovox.calibrate.live_clock import CameraClock
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.frame import FORWARD, AnyFrame, Cloud, Frame, name_of
+from stereovox.frame import FORWARD, AnyFrame, Frame, Rays, name_of
 from stereovox.frame.wall_clock import epoch_ns
 from stereovox.geometry.se3 import Transform, covariance_at, inverse
 from stereovox.live.rig import LiveCamera, check_cameras
@@ -215,7 +215,7 @@ class LiveStream(Stream):
     def mount(self, frame: AnyFrame) -> Transform:
         """Return T_body_sensor (4, 4) for the sensor of a frame of this stream; for a cloud, from its own axes."""
         mount = self.mounts[frame.sensor]
-        return mount @ T_OPTICAL_BODY if isinstance(frame, Cloud) else mount
+        return mount @ T_OPTICAL_BODY if isinstance(frame, Rays) else mount
 
     @property
     def why_none(self) -> str:

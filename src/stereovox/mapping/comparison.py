@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.cameras.lidar import Lidar, RangeSensor
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage, Range
+from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
@@ -99,7 +99,7 @@ class Comparison:
         self._prepared = False
 
     def check(
-        self, frame: AnyFrame | Range, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
+        self, frame: AnyFrame, image: AnyImage, evidence: Evidence, passed: GateResult, voxel_map: VoxelMap
     ) -> GateResult:
         """Return what the gate needs to accept the frame; a cone is not compared, for it yields to the map.
 

@@ -24,7 +24,7 @@ from stereovox.depth.cloud import checked_cloud
 from stereovox.depth.prepare import downsample, shortened
 from stereovox.depth.ranges import cloud_of
 from stereovox.errors import ConfigError, FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Cloud, DepthImage, Frame, Range
+from stereovox.frame import AnyFrame, AnyImage, Cloud, DepthImage, Frame, Rays
 from stereovox.integrate import Integration
 from stereovox.integrate.views import MAX_CAMERAS
 from stereovox.kernels.threads import Ahead
@@ -57,7 +57,7 @@ class Deadline:
             raise FrameRefused("no_time", "skipped: frames take longer than deadline_ms even at the quickest level")
         return self._levels[self._scheduler.level]
 
-    def expect(self, frame: AnyFrame | Range) -> None:
+    def expect(self, frame: AnyFrame) -> None:
         """Begin to prepare the next frame if its level is already known."""
         if self._scheduler is None:
             self._levels[0].prepare.begin(frame)
@@ -67,7 +67,7 @@ class Deadline:
         if self._scheduler is not None:
             self._scheduler.record(milliseconds)
 
-    def warm_up(self, frame: AnyFrame | Range, camera: VirtualCamera | Lidar) -> None:
+    def warm_up(self, frame: AnyFrame, camera: VirtualCamera | Lidar) -> None:
         """Run each camera's first frame through all other levels, so that no kernel compiles when time is short."""
         if self._scheduler is None or camera in self._warm or len(self._warm) >= MAX_CAMERAS:
             return  # a source with a new camera in each frame would warm up for ever
@@ -114,12 +114,11 @@ class Quality:
         self.prepare = Ahead(partial(prepared, depth, config))  # without `self`, which would keep itself alive
 
 
-def prepared(depth: DepthStage, config: Config, frame: AnyFrame | Range) -> Prepared:
+def prepared(depth: DepthStage, config: Config, frame: AnyFrame) -> Prepared:
     """Return the depth image of a frame, or the checked cloud. Raises FrameRefused as `depth` or `checked_cloud`."""
     started = perf_counter()
-    if isinstance(frame, Range):
+    if isinstance(frame, Rays):  # whole at every level: the level's integrator cuts its rays
         frame = cloud_of(frame, config)
-    if isinstance(frame, Cloud):  # whole at every level: the level's integrator cuts its rays
         return Prepared(frame, checked_cloud(frame, config), 0.0, 1e3 * (perf_counter() - started))
     depth_frame = depth.matched(frame)
     matched = started if depth_frame is frame else perf_counter()

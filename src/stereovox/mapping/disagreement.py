@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, Range, Scan, name_of
+from stereovox.frame import AnyFrame, Scan, name_of
 from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import CHANGED, MAX_SENSORS, MOVED, DisagreementSpell, History, RunningMean
 
@@ -149,7 +149,7 @@ class DisagreementMonitor:
         return not self._agrees(doubt, sensor, stamp_ns, against)
 
     def check(
-        self, frame: AnyFrame | Scan | Range, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan, sensor: str, stamp_ns: int, against: float | None, sight: Sight | None
     ) -> Agreement:
         """Return what `accept` needs once the map has changed.
 
@@ -218,7 +218,7 @@ class DisagreementMonitor:
 
     def _refusal(
         self,
-        frame: AnyFrame | Scan | Range,
+        frame: AnyFrame | Scan,
         against: float | None,
         limit: float,
         doubt: DisagreementSpell,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, Range, Scan
+from stereovox.frame import AnyFrame, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import Transform, rotation_matrix
 from stereovox.mapping.comparison import GAIN, TRIED, Placed, explained, sight, thinned
@@ -63,7 +63,7 @@ class FloorComparison:
         self._around = max(1, ceil(round(ERROR_M / config.voxel_size, 6)))
 
     def check(
-        self, frame: AnyFrame | Scan | Range, scan: Scan, evidence: GridEvidence, passed: GateResult, grid_map: GridMap
+        self, frame: AnyFrame | Scan, scan: Scan, evidence: GridEvidence, passed: GateResult, grid_map: GridMap
     ) -> GateResult:
         """Return what the gate needs to accept `scan`, which was made from `frame`.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Scan, StereoFrame, name_of
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Rays, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
 from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, moved_on, with_glance
@@ -93,7 +93,7 @@ class Gate:
             round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
         )
 
-    def check(self, frame: AnyFrame | Scan | Range, image: AnyImage | Scan | Range) -> GateResult:
+    def check(self, frame: AnyFrame | Scan, image: AnyImage | Scan | Range) -> GateResult:
         """Return what `accept` needs once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
@@ -132,7 +132,7 @@ class Gate:
         return any(abs(one.pose[11] - height) > metres for name, one in trusted if name not in ignored)
 
     def check_agreement(
-        self, frame: AnyFrame | Scan | Range, passed: GateResult, against: float | None, sight: Sight | None
+        self, frame: AnyFrame | Scan, passed: GateResult, against: float | None, sight: Sight | None
     ) -> GateResult:
         """Return what `accept` needs for a frame that was compared with the map.
 
@@ -158,7 +158,7 @@ class Gate:
         if passed.after:
             self._history.settled[passed.after] += 1
 
-    def _identify(self, frame: AnyFrame | Scan | Range) -> tuple[str, int]:
+    def _identify(self, frame: AnyFrame | Scan) -> tuple[str, int]:
         """Return sensor and stamp of a frame with valid fields (`validate_fields`); refuse poses far off in time."""
         off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
@@ -218,7 +218,7 @@ class Gate:
             raise FrameRefused("frozen_image", f"{name_of(frame)}: {detail}")
         return with_glance(glances, passed.seen, ranges)
 
-    def _fitting(self, frame: AnyFrame | Scan | Range, sensor: str, now: StampedPose) -> GateResult:
+    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> GateResult:
         """Return a frame that fits the last trusted one or is accepted again; refuse any other."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
@@ -246,7 +246,7 @@ class Gate:
 
     def _settled(
         self,
-        frame: AnyFrame | Scan | Range,
+        frame: AnyFrame | Scan,
         passed: GateResult,
         trusted: StampedPose,
         found: tuple[str, float],
@@ -295,6 +295,8 @@ def _digest(frame: AnyFrame | Scan) -> int:
         parts = _rows(frame.left), _rows(frame.right)
     elif isinstance(frame, Cloud):
         parts = (frame.points[:: max(1, len(frame.points) // DIGEST_POINTS)],)
+    elif isinstance(frame, Range):
+        parts = (np.array([frame.distance]),)
     else:
         parts = (frame.ranges if isinstance(frame, Scan) else _rows(frame.depth),)
     number = 0
@@ -309,7 +311,7 @@ def _is_measured(frame: AnyFrame | Scan) -> bool:
     The inverse depth of a plane does not bend in an image, nor, corrected for the angle step, between beams. Stereo
     frames and clouds always count as measured.
     """
-    if isinstance(frame, StereoFrame | Cloud):
+    if isinstance(frame, StereoFrame | Rays):
         return True
     is_scan = isinstance(frame, Scan)
     rows = (frame.ranges[None] if is_scan else _rows(frame.depth)).astype(float)

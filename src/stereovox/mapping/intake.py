@@ -40,7 +40,7 @@ class Intake:
         self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
         self._map, self._adding = target, MapLock()
 
-    def offer(self, frame: AnyFrame | Scan | Range) -> PendingFrame:
+    def offer(self, frame: AnyFrame | Scan) -> PendingFrame:
         """Return a frame that arrives now; use it in a `with` block around the integration.
 
         Raises:
@@ -123,7 +123,7 @@ class PendingFrame:
     __slots__ = ("_arrived_ns", "_frame", "_intake", "report")
     report: UpdateReport
 
-    def __init__(self, intake: Intake, frame: AnyFrame | Scan | Range, arrived_ns: int):
+    def __init__(self, intake: Intake, frame: AnyFrame | Scan, arrived_ns: int):
         self._intake, self._frame, self._arrived_ns = intake, frame, arrived_ns
 
     def __enter__(self) -> PendingFrame:

@@ -102,8 +102,8 @@ def see(table, coords, cells, unknown, limits, indices, around, out):
 
 
 @cell
-def share_until(table, coords, cells, least, x, y, to_x, to_y):
-    """Return how far (0 to 1) a line runs until a cell holds `least` or more; infinity if there is none.
+def share_until(table, coords, cells, unknown, least, x, y, to_x, to_y):
+    """Return how far (0 to 1) a line runs until a known cell holds `least` or more; infinity if there is none.
 
     It is looked at every STEP cells at most, so corners that it cuts do not count.
     """
@@ -115,16 +115,17 @@ def share_until(table, coords, cells, least, x, y, to_x, to_y):
         if (column >> 6 != at_x) | (row >> 6 != at_y):
             at_x, at_y = column >> 6, row >> 6
             tile = find(table, coords, at_x, at_y, 0)
-        if tile >= 0 and cells[tile, ((row & 63) << 6) | (column & 63)] >= least:
+        number = cells[tile, ((row & 63) << 6) | (column & 63)] if tile >= 0 else unknown
+        if number != unknown and number >= least:
             return share
     return np.inf
 
 
 @kernel
-def cast(table, coords, cells, least, lines, out):
+def cast(table, coords, cells, unknown, least, lines, out):
     """Write to `out` (n,) how far lines (n, 4), in cells, run; see `share_until`."""
     for i in range(lines.shape[0]):
-        out[i] = share_until(table, coords, cells, least, lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3])
+        out[i] = share_until(table, coords, cells, unknown, least, lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3])
 
 
 @kernel
@@ -149,5 +150,5 @@ def weigh(table, coords, cells, unknown, limits, sure, around, deep, ends, step,
         if met == UNKNOWN and length > deep:
             share = 1 - deep / length
             end_x, end_y = x + share * (to_x - x), y + share * (to_y - y)
-            through += 1 if share_until(table, coords, cells, sure, x, y, end_x, end_y) <= 1 else 0
+            through += 1 if share_until(table, coords, cells, unknown, sure, x, y, end_x, end_y) <= 1 else 0
     out[0], out[1], out[2], out[3] = agree, into, through, every

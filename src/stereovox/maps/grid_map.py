@@ -118,8 +118,8 @@ class GridStorage(Guarded):
 
     def cast(self, lines: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far (0 to 1) lines (N, 4), x, y to x, y in cells, run to an occupied cell; inf where none is."""
-        pool, found = self._pool, np.empty(len(lines))
-        _grid.cast(pool.table, pool.coords, pool.values, self.rules.thresholds.occupied_least, lines, found)
+        pool, found, unknown = self._pool, np.empty(len(lines)), np.int32(self.cell_format.unknown)
+        _grid.cast(pool.table, pool.coords, pool.values, unknown, self.rules.thresholds.occupied_least, lines, found)
         return found
 
     def surfaces(self, left: int, bottom: int, rows: int, columns: int) -> NDArray[np.bool_]:

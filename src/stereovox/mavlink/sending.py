@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import StereovoxError
-from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Cloud, UpdateReport
+from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Rays, UpdateReport
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.mapper import Mapper
 from stereovox.mavlink.body import Body, BodyPose
@@ -108,7 +108,7 @@ class ObstacleSender:
         """
         if report.refused is not None:
             return
-        mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Cloud) else None)
+        mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Rays) else None)
         T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
         T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)
         self.at(T_world_body, frame.sensor, stamp_ns=frame.stamp_ns or None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -17,14 +17,14 @@ from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Cloud, Frame, Scan
+from stereovox.frame import Cloud, Frame, Range, Scan
 from stereovox.geometry.se3 import inverse
 from stereovox.ros.poses.poses import Pose, PoseBuffer
 from stereovox.sources.bags.compressed_depth import SUFFIXES, plain_topic
 from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
-from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud
-from stereovox.sources.clouds.bag import cloud_of_scan
+from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud, read_range
+from stereovox.sources.clouds.bag import cloud_of_scan, range_of_reading
 from stereovox.sources.clouds.options import LidarOptions
 from stereovox.sources.poses.poses import seconds_from_ns
 from stereovox.sources.robots.bag import posed_scan
@@ -34,6 +34,7 @@ LONGEST_SWEEP_S = 0.5
 """Most seconds of a lidar's sweep; clouds whose points have later times do not wait for the poses of these."""
 NO_POSE = np.full((4, 4), np.nan)
 NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
+SeenT = TypeVar("SeenT", Cloud, Range)
 PoseLookup = Callable[[str, int], Pose]
 """Returns the pose of a frame (by its name) at a time in nanoseconds; raises FrameRefused."""
 
@@ -56,7 +57,7 @@ class Input(Protocol):
         """Return whether no later message can change the pose of a message."""
         return poses.is_final(frame_id, stamp_ns)
 
-    def frame(self, data: bytes, where: PoseLookup) -> Frame | Cloud | Scan | None:
+    def frame(self, data: bytes, where: PoseLookup) -> Frame | Cloud | Range | Scan | None:
         """Convert a message; the `fault` of the result says why it cannot be used. None: do not map it."""
         ...
 
@@ -146,7 +147,7 @@ class CloudInput(Input):
         try:
             cloud = read_point_cloud(Wire(data, cdr=True))
             frame_id = frame_name(cloud.frame_id)
-            found = _cloud_at(Cloud(cloud.points, NO_POSE, cloud.stamp_ns, self._lidar), self.topic, where, frame_id)
+            found = _at(Cloud(cloud.points, NO_POSE, cloud.stamp_ns, self._lidar), self.topic, where, frame_id)
             if cloud.times_s is None:
                 return found
             last_s = float(np.max(cloud.times_s, initial=0.0, where=np.isfinite(cloud.times_s)))
@@ -168,7 +169,25 @@ class RaysInput(Input):
         """Convert a laser scan."""
         try:
             scan = read_laser_scan(Wire(data, cdr=True))
-            return _cloud_at(cloud_of_scan(scan, self._options), self.topic, where, frame_name(scan.frame_id))
+            return _at(cloud_of_scan(scan, self._options), self.topic, where, frame_name(scan.frame_id))
+        except (FrameRefused, StereovoxError, ValueError) as error:
+            return _no_cloud(self.topic, error)
+
+
+class RangeInput(Input):
+    """Distances of a sonar or radar, for 3-D and floor maps. silence_clears: as in `RangeSensor`."""
+
+    kind = "sensor_msgs/Range"
+
+    def __init__(self, topic: str, silence_clears: bool = False):
+        self.topic, self._silence_clears = topic, silence_clears
+
+    def frame(self, data: bytes, where: PoseLookup) -> Range | Cloud:
+        """Convert a distance."""
+        try:
+            reading = read_range(Wire(data, cdr=True))
+            found = range_of_reading(reading, silence_clears=self._silence_clears)
+            return _at(found, self.topic, where, frame_name(reading.frame_id))
         except (FrameRefused, StereovoxError, ValueError) as error:
             return _no_cloud(self.topic, error)
 
@@ -217,11 +236,11 @@ class ScanInput(Input):
         return replace(scan, sensor=self.topic)
 
 
-def _cloud_at(cloud: Cloud, topic: str, where: PoseLookup, frame_id: str) -> Cloud:
-    """Return a cloud at the pose of its sensor. Raises FrameRefused."""
-    T_world_sensor, _, off_ns = where(frame_id, cloud.stamp_ns)
-    name = _frame_title(topic, cloud.stamp_ns)
-    return replace(cloud, T_world_sensor=T_world_sensor, pose_off_ns=off_ns, name=name, sensor=topic)
+def _at(seen: SeenT, topic: str, where: PoseLookup, frame_id: str) -> SeenT:
+    """Return a cloud or range at the pose of its sensor. Raises FrameRefused."""
+    T_world_sensor, _, off_ns = where(frame_id, seen.stamp_ns)
+    name = _frame_title(topic, seen.stamp_ns)
+    return replace(seen, T_world_sensor=T_world_sensor, pose_off_ns=off_ns, name=name, sensor=topic)
 
 
 def _no_cloud(topic: str, error: Exception) -> Cloud:

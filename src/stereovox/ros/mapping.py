@@ -11,7 +11,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.formats.map_server import read_map_server
-from stereovox.frame import Cloud, Frame, Scan, UpdateReport
+from stereovox.frame import Cloud, Frame, Range, Scan, UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
@@ -69,7 +69,7 @@ class Mapping:
         """Set the clock of the frames' stamps, as `Mapper.stamp_clock`, for this mapper and later ones."""
         self._stamp_clock = self.mapper.stamp_clock = clock
 
-    def add(self, frame: Frame | Cloud | Scan) -> UpdateReport:
+    def add(self, frame: Frame | Cloud | Range | Scan) -> UpdateReport:
         """Add a frame or scan to the map."""
         return self.mapper.add(frame)
 
@@ -86,9 +86,9 @@ class Mapping:
         """Return how current the map is."""
         return self.mapper.health()
 
-    def grid(self) -> OccupancyGrid | None:
-        """Return the 2-D map; None if nothing is known."""
-        return self._above()
+    def grid(self, last: bool = False) -> OccupancyGrid | None:
+        """Return the 2-D map; None if nothing is known. last: of a run, as `LiveProjection.grid`."""
+        return self._above(last=last)
 
     def snapshot(self) -> Callable[[], VoxelMap] | None:
         """Return a function that copies the cells in memory, callable from any thread; None for a floor map."""
@@ -141,7 +141,7 @@ class Mapping:
 
     def _begin_floor(self, config: Config, saved: OccupancyGrid | None = None) -> None:
         mapper = GridMapper(config, resume=saved, stamp_clock=self._stamp_clock)
-        self.mapper, self._above = mapper, lambda: _unless_empty(mapper.occupancy())
+        self.mapper, self._above = mapper, lambda last=False: _unless_empty(mapper.occupancy())
 
 
 def _correct(mapper: Mapper, poses_of: PosesOf) -> CorrectionReport:

@@ -23,7 +23,7 @@ from stereovox.sources.clouds.options import LidarOptions
 
 PREFIX = "ros."
 """Prefix of the parameters that are options of the node."""
-LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed", "exclude")
+LISTS = ("depth", "cloud", "scan", "range", "odometry", "pose", "fixed", "exclude")
 SLAM = "slam"
 POSES = (GIVEN, TRACK, SLAM)
 OUT = f"{PREFIX}out"
@@ -36,7 +36,8 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrid
 class Options:
     """Options of the command, and parameters of the node with the prefix `ros.`.
 
-    depth: topics of depth images; `TOPIC=INFO` if the camera_info is not next to it. cloud, scan: topics.
+    depth: topics of depth images; `TOPIC=INFO` if the camera_info is not next to it. cloud, scan, range: topics;
+    silence_clears: whether the cone of a range in which nothing was heard is free.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
     poses: `given`, from tf and the topics above; `track`, from the first depth camera by visual odometry; `slam`, by
@@ -66,6 +67,8 @@ class Options:
     depth: tuple[str, ...] = ()
     cloud: tuple[str, ...] = ()
     scan: tuple[str, ...] = ()
+    range: tuple[str, ...] = ()
+    silence_clears: bool = False
     odometry: tuple[str, ...] = ()
     pose: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
@@ -149,8 +152,8 @@ class Options:
 
     def check_sources(self) -> Options:
         """Return these options; raises StereovoxError without an input topic, or if options exclude each other."""
-        if not (self.depth or self.cloud or self.scan or (self.localised and self.lidar)):
-            raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
+        if not (self.depth or self.cloud or self.scan or self.range or (self.localised and self.lidar)):
+            raise StereovoxError("no topic to map; give --depth /camera/image_rect_raw, --cloud, --scan or --range")
         if self.poses == TRACK and not self.depth:
             raise StereovoxError("--poses track: it needs a depth camera; give --depth, or poses by --poses given")
         if self.poses == TRACK and (self.odometry or self.pose):

@@ -185,7 +185,7 @@ class Outputs:
     def close(self) -> None:
         """Publish the final map and wait for messages in progress."""
         if self._new_map:
-            self._publish_map(self._clock())
+            self._publish_map(self._clock(), last=True)
         self._worker.shutdown()
 
     def _current(self) -> bool:
@@ -196,19 +196,19 @@ class Outputs:
             self._node.get_logger().error(text, throttle_duration_sec=10.0)
         return health.state not in UNFIT
 
-    def _publish_map(self, now: float) -> None:
+    def _publish_map(self, now: float, last: bool = False) -> None:
         self._new_map = self._corrected = False
         heard = self._publishers.map.get_subscription_count() > 0
         period = 1 / self._options.map_rate if heard else UNHEARD_S
         self._next_map = max(self._next_map, now - period) + period  # one frame may be early: camera rates vary
-        grid = self._grid()
+        grid = self._grid(last)
         if grid is not None:
             self._publishers.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
 
-    def _grid(self) -> OccupancyGrid | None:
+    def _grid(self, last: bool = False) -> OccupancyGrid | None:
         """Return the 2-D map; None if nothing is known, or, after logging it, if it cannot be made."""
         try:
-            return self._mapping.grid()
+            return self._mapping.grid(last)
         except StereovoxError as error:
             self._log_error(error)
             return None

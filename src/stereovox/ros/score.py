@@ -76,13 +76,13 @@ class Score:
         """Score the present map, and return Eq 7 and its parts in per cent; empty without a map."""
         self._work.drop()
         self._busy = False
-        if (grid := self._grid()) is not None:
+        if (grid := self._grid(last=True)) is not None:
             self._take(lambda: error_of(grid, self._reference, self._exclude))
         return self.counts()
 
-    def _grid(self) -> OccupancyGrid | None:
+    def _grid(self, last: bool = False) -> OccupancyGrid | None:
         try:
-            return self._mapping.grid()  # a copy, since the map may change
+            return self._mapping.grid(last)  # a copy, since the map may change
         except StereovoxError as error:
             self._node.get_logger().warning(f"no score: {error}", throttle_duration_sec=30.0)
             return None

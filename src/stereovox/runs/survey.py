@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, Cloud, Frame, StereoFrame
+from stereovox.frame import AnyFrame, Cloud, Frame, Range, Rays, StereoFrame
 from stereovox.geometry.se3 import Transform, inverse, rigidity_error, rotation_vector
 from stereovox.products.floor.floor_axes import nearest_axis, up_of, upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.sources.base import Source, Stream
 from stereovox.track.tracker import LEVEL as AHEAD
 
-KINDS = {StereoFrame: "stereo", Frame: "depth", Cloud: "cloud"}
+KINDS = {StereoFrame: "stereo", Frame: "depth", Cloud: "cloud", Range: "range"}
 """Kind of a recording, by the type of its frames."""
 RIGID = 0.05
 """Largest entry of abs(R^T R - I) for a pose that is used here."""
@@ -210,7 +210,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     read = [source.frame(i) for i in numbers]
     posed = [frame for frame in read if _has_pose(frame)]
     images = [frame for frame in read if isinstance(frame, Frame) and frame.depth.size]
-    depths = [_depth_m(frame) for frame in images] + [_ranges(frame) for frame in read if isinstance(frame, Cloud)]
+    depths = [_depth_m(frame) for frame in images] + [_ranges(frame) for frame in read if isinstance(frame, Rays)]
     valid = np.concatenate([np.empty(0), *(depth[np.isfinite(depth)] for depth in depths)])
     pixels = sum(depth.size for depth in depths)
     max_range = suggest_range(valid, source.camera, stereo=isinstance(read[0], StereoFrame))
@@ -373,11 +373,13 @@ def _has_pose(frame: AnyFrame) -> bool:
 
 def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
     """Return the direction (3,) in the world that is up if the sensor is upright; lidars have other axes."""
-    return frame.T_world_sensor[:3, 2] if isinstance(frame, Cloud) else -frame.T_world_sensor[:3, 1]
+    return frame.T_world_sensor[:3, 2] if isinstance(frame, Rays) else -frame.T_world_sensor[:3, 1]
 
 
-def _ranges(cloud: Cloud) -> NDArray[np.float64]:
-    """Return a sample of a cloud's ranges in metres, NaN for rays without a range."""
+def _ranges(cloud: Rays) -> NDArray[np.float64]:
+    """Return a sample of a cloud's ranges in metres, NaN for rays without a range; of a range, itself."""
+    if isinstance(cloud, Range):
+        return np.where(np.isfinite([cloud.distance]), [cloud.distance], np.nan)
     ranges = np.linalg.norm(cloud.points[:: max(1, len(cloud.points) // 10_000)].astype(float), axis=1)
     return np.where(ranges > cloud.lidar.range_min, ranges, np.nan)
 

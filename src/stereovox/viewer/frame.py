@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.depth import DepthPipeline
 from stereovox.depth.cloud import checked_cloud
+from stereovox.depth.ranges import cloud_of
 from stereovox.errors import FrameRefused
 from stereovox.frame import (
     AnyFrame,
     CheckedCloud,
-    Cloud,
     DepthImage,
-    Frame,
+    Rays,
     Reason,
-    StereoFrame,
     UpdateReport,
     name_of,
 )
@@ -97,14 +96,14 @@ class FramePanel:
 
     def _picture(self, frame: AnyFrame) -> NDArray[np.uint8]:
         far = self._config.max_range
-        if isinstance(frame, Cloud):
-            return cloud_picture(checked_cloud(frame, self._config), far)
+        if isinstance(frame, Rays):
+            return cloud_picture(checked_cloud(cloud_of(frame, self._config), self._config), far)
         return depth_picture(self._path.image(self._path.matched(frame)), far)
 
 
 def describe_frame(frame: AnyFrame, report: UpdateReport | None) -> str:
     """Return name and outcome of a frame, or of any object offered as one, as Markdown."""
-    called = name_of(frame) if isinstance(frame, Frame | StereoFrame | Cloud) else type(frame).__name__
+    called = name_of(frame) if isinstance(frame, AnyFrame) else type(frame).__name__
     name = plain(str(called).rpartition("/")[2])
     if report is None:
         return name

@@ -212,3 +212,18 @@ def test_with_another_prior_the_same_evidence_decides(prior):
         for rules, start in zip((usual, other), at, strict=True)
     )
     assert np.count_nonzero(expected != found) <= 2  # at a threshold, by rounding
+
+
+@pytest.mark.parametrize("profile", ["default", "safe", "crisp", "chien2020", "valenti2018"])
+@pytest.mark.parametrize("cell", FORMATS)
+def test_weak_evidence_counts_in_unknown_cells_and_yields_to_what_is_known(profile, cell):
+    """Whatever number stands for "unknown": with a prior of 0.1 it is above the threshold of occupied cells."""
+    rules = CellRules(load_config(profile, **{"map.cell": cell}).map)
+    free, occupied, unknown = *map(int, rules.thresholds), rules.format.unknown
+    sure, start = int(rules.sure[2]), int(rules.prior)
+    cells = np.array([unknown, start, free, occupied, sure, rules.highest])
+    up, down = np.full(6, 40, np.int16), np.full(6, -40, np.int16)
+    assert (rules.yielding(up, cells, again=False) > 0).tolist() == [True, True, True, False, False, False]
+    assert (rules.yielding(down, cells, again=False) < 0).tolist() == [True, True, True, occupied < sure, False, False]
+    assert (rules.yielding(up, cells, again=True) > 0).tolist() == [False, start <= free, True, False, False, False]
+    assert not rules.yielding(down, cells, again=True).any()

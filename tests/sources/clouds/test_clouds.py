@@ -368,12 +368,67 @@ def test_beams_without_echo_are_free_up_to_where_the_lidar_measures(tmp_path):
     np.testing.assert_allclose(cloud.clear[0], (5.6 - 4 * 0.02) * np.array([np.cos(-0.5), np.sin(-0.5), 0]), atol=1e-5)
 
 
+RING = {"/left": ("left", 0.5), "/right": ("right", -0.5)}
+"""Sonars of a robot: frame and yaw."""
+
+
+def write_sonars(path, distances):
+    """Write two sonars of a base that drives along x at 1 m/s; the right one is silent."""
+    with RobotBagMaker(path) as bag:
+        for frame, yaw in RING.values():
+            bag.tf(START_NS, "base_link", frame, planar_numbers(0.2, 0, yaw), "/tf_static")
+        for k in range(-5, 10 * len(distances)):
+            stamp = START_NS + 10 * k * MS
+            bag.tf(stamp, "odom", "base_link", planar_numbers(0.01 * k, 0, 0))
+        for n, distance in enumerate(distances):
+            for m, (topic, (frame, _)) in enumerate(RING.items()):
+                stamp = START_NS + (100 * n + 30 * m) * MS
+                message = bag.make(
+                    "sensor_msgs/Range", header=bag.header(stamp, frame), radiation_type=0, field_of_view=0.4,
+                    min_range=0.2, max_range=3.0, range=distance if m == 0 else 3.0,
+                )  # fmt: skip
+                bag.add(topic, "sensor_msgs/Range", stamp, message)
+    return path
+
+
+@pytest.mark.parametrize("name", ["sonars.bag", "sonars"])
+def test_ranges_of_several_sonars_in_a_bag(tmp_path, name):
+    heard = [1.0, 1.5, np.inf, -np.inf, np.nan, 3.5, 0.1, 3.0]
+    source = sv.open_source(f"{write_sonars(tmp_path / name, heard)}?range=/left,/right")
+    seen = list(source)
+    assert [one.sensor for one in seen] == ["/left", "/right"] * len(heard)
+    distances = [one.distance for one in seen if one.sensor == "/left"]
+    np.testing.assert_equal(distances, [1.0, 1.5, np.inf, -np.inf, np.nan, np.nan, np.nan, np.inf])
+    for one in seen:
+        yaw = dict(RING.values())[one.sensor[1:]]
+        np.testing.assert_allclose(
+            one.T_world_sensor, planar_motion(0.2 + (one.stamp_ns - START_NS) / 1e9, 0, yaw), atol=1e-6
+        )
+        assert (one.beam.beam, one.beam.range_max) == (pytest.approx(0.4), 3.0)
+    mapper = sv.Mapper(voxel_size=0.1)
+    assert [mapper.add(one).refused for one in seen] == [None, "no_valid_range"] * 2 + ["no_valid_range"] * 12
+    free = sv.open_source(f"{tmp_path / name}?range=/right&silence_clears=1&sigma=0.1")
+    assert mapper.add(free.frame(0)).refused is None
+    assert free.frame(0).beam.sigma == 0.1
+
+
+def test_a_bag_of_ranges_becomes_a_map_by_the_command(tmp_path, capsys):
+    bag = write_sonars(tmp_path / "sonars.bag", [1.0, 1.0, 1.0, 1.01, 1.02, 1.0])
+    assert main(["map", f"{bag}?range=/left", "--out", str(tmp_path / "m.svox"), "--voxel-size", "0.1"]) == 0
+    found = sv.load_map(tmp_path / "m.svox")
+    ahead = planar_motion(0.2, 0, 0.5) @ [0.5, 0, 0, 1]
+    assert found.probability(ahead[None, :3])[0] < 0.4
+    with pytest.raises(SourceError, match=r"holds sensor_msgs/Range; \?scan= needs"):
+        sv.open_source(f"{bag}?scan=/left")
+
+
 @pytest.mark.parametrize(
     ("options", "why"),
     [
         ("cloud=/nowhere", "no topic /nowhere"),
         ("cloud=/scan", "holds sensor_msgs/LaserScan"),
         ("cloud=/points&scan=/scan", "give one of"),
+        ("cloud=/points,/scan", "holds sensor_msgs/LaserScan"),
         ("cloud=/points&depth=/d", "unknown parameter 'depth'"),
         ("cloud=/points&sigma=0.0001&range_min=-3", "range"),
     ],

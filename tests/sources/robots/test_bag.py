@@ -494,3 +494,48 @@ def test_a_mount_turns_by_yaw_then_pitch_then_roll():
     assert T is not None
     np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("ZYX", [0.5, -0.4, 0.3]).as_matrix(), atol=1e-12)
     assert T[:3, 3].tolist() == [1, 2, 3]
+
+
+def room_ranges(random, x: float, echoes: int) -> np.ndarray:
+    """Return 100 ranges in a room of 8 m by 6 m from x, of which the last few met nothing and are 25 m."""
+    angles = np.linspace(-np.pi, np.pi, 100, endpoint=False)
+    with np.errstate(divide="ignore"):
+        walls = np.minimum(
+            np.where(np.cos(angles) > 0, 4 - x, 4 + x) / np.abs(np.cos(angles)), 3 / np.abs(np.sin(angles))
+        )
+    ranges = walls + random.normal(0, 0.01, 100)
+    ranges[echoes:] = 25.0
+    return ranges
+
+
+@pytest.mark.parametrize(("echoes", "query", "known"), [(95, "", 95), (100, "", 100), (95, "?range_max=20", 95)])
+def test_a_mark_of_no_echo_below_range_max_is_no_wall(tmp_path, echoes, query, known):
+    random = np.random.default_rng(3)
+
+    def scans(bag: RobotBagMaker) -> None:
+        for k in range(8):
+            ranges = room_ranges(random, 0.1 * k, echoes)
+            message = bag.scan(at(k / 10), ranges, range_max=40.0, angle_increment=2 * np.pi / 100)
+            bag.add("/scan", "sensor_msgs/LaserScan", at(k / 10), message)
+
+    robot = RobotBag(f"{made(tmp_path / 'a.bag', mounts, drive, scans)}{query}")
+    for scan in robot.scans:
+        assert np.isfinite(scan.ranges[:echoes]).all()
+        assert np.isfinite(scan.ranges).sum() == known
+        assert np.isposinf(scan.ranges).sum() == (5 if query else 0)
+    noted = [note for note in robot.notes if "mark of no echo" in note]
+    assert len(noted) == (known < 100 and not query)
+
+
+def test_the_wall_behind_a_door_is_no_mark(tmp_path):
+    random = np.random.default_rng(4)
+
+    def scans(bag: RobotBagMaker) -> None:
+        for k in range(8):
+            ranges = room_ranges(random, 0.0, 97)
+            ranges[97:] = 12 + random.normal(0, 0.005, 3)
+            message = bag.scan(at(k / 10), ranges, range_max=40.0, angle_increment=2 * np.pi / 100)
+            bag.add("/scan", "sensor_msgs/LaserScan", at(k / 10), message)
+
+    robot = RobotBag(made(tmp_path / "a.bag", mounts, drive, scans))
+    assert all(np.isfinite(scan.ranges).all() for scan in robot.scans)

@@ -33,6 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         ),
         ("cloud", "TOPIC", "point clouds"),
         ("scan", "TOPIC", "laser scans"),
+        ("range", "TOPIC", "distances of sonars or radars"),
         ("odometry", "TOPIC", "poses as nav_msgs/Odometry, besides /tf"),
         ("pose", "TOPIC=FRAME", "poses of a frame as geometry_msgs/PoseStamped"),
         ("fixed", "TEXT", "fixed pose of a frame: 'PARENT CHILD x y z yaw pitch roll'"),

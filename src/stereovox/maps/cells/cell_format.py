@@ -174,9 +174,9 @@ class CellRules:
         It clears no surely occupied cell, and adds to no occupied one. again: it repeats what was added before, so only
         what is for something in a free cell counts.
         """
-        cells = stored.astype(np.int32)
+        cells = np.where(stored == self.format.unknown, self.prior, stored.astype(np.int32))
         if again:
-            counts = (values > 0) & (cells <= self.thresholds.free_most) & (cells != self.format.unknown)
+            counts = (values > 0) & (cells <= self.thresholds.free_most) & (stored != self.format.unknown)
         else:
             counts = np.where(values > 0, cells < self.thresholds.occupied_least, cells < self.sure[2])
         return np.where(counts, values, values.dtype.type(0))

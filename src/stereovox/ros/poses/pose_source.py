@@ -12,7 +12,7 @@ from stereovox.errors import StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.localize.robot_track import doubt_lines, parse_start, refused_line
 from stereovox.localize.slam.pipeline import SlamResult
-from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, RaysInput, ScanInput
+from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, RangeInput, RaysInput, ScanInput
 from stereovox.ros.map_server import MapServer
 from stereovox.ros.options import SLAM, Options, split_pair
 from stereovox.ros.poses.localization import (
@@ -178,10 +178,11 @@ def pose_source(node: Any, config: Config, options: Options, late: Late = never_
 def inputs_of(options: Options, dimensions: int) -> list[Input]:
     """Return the topics to map."""
     depth = [DepthInput(*split_pair(text)) for text in options.depth]
+    ranges = [RangeInput(topic, options.silence_clears) for topic in options.range]
     if dimensions == 2:
-        return [*depth, *map(FloorCloudInput, options.cloud), *map(ScanInput, options.scan)]
+        return [*depth, *ranges, *map(FloorCloudInput, options.cloud), *map(ScanInput, options.scan)]
     clouds = [CloudInput(topic, options.ranges.lidar) for topic in options.cloud]
-    return [*depth, *clouds, *(RaysInput(topic, options.ranges) for topic in options.scan)]
+    return [*depth, *ranges, *clouds, *(RaysInput(topic, options.ranges) for topic in options.scan)]
 
 
 def _figures(result: SlamResult) -> dict[str, Any]:

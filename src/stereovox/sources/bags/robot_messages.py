@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import atan2, hypot, isfinite
+from math import atan2, hypot, inf, isfinite, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from stereovox.sources.bags.messages import Wire
 
 OCCUPANCY_GRID, OCTOMAP = "nav_msgs/OccupancyGrid", "octomap_msgs/Octomap"
 LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
+RANGE = "sensor_msgs/Range"
 LIVOX = tuple(f"{package}/CustomMsg" for package in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
 CLOUDS = (POINT_CLOUD, "sensor_msgs/PointCloud", *LIVOX)
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
@@ -86,6 +87,44 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
         beyond = (ranges > np.float32(range_max)) & (ranges < np.inf) & (not given)
     marked = np.where(near, -np.inf, np.where(beyond, np.nan, np.where(far, np.inf, ranges))).astype(np.float32)
     return LaserScan(stamp_ns, frame_id, angle_min, angle_step, range_min, range_max, marked, int(beyond.sum()))
+
+
+@dataclass(frozen=True)
+class RangeReading:
+    """A `sensor_msgs/Range` in frame `frame_id`, whose x axis is that of the cone.
+
+    distance: metres as in `frame.Range`: NaN no reading, -inf too near, +inf nothing up to `range_max`. beam: full
+    width of the cone in radians, 0 if it is not given. sigma: standard deviation in metres, 0 if it is not given.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    distance: float
+    beam: float
+    range_min: float
+    range_max: float
+    sigma: float = 0.0
+
+
+def read_range(wire: Wire) -> RangeReading:
+    """Return a `sensor_msgs/Range`.
+
+    As Range.msg asks, distances outside `range_min` to `range_max` are discarded (NaN); +inf is silence and -inf an
+    echo that is too near. `range_max` itself is silence, too: drivers write it if nothing was heard. Sensors of a fixed
+    distance (`range_min` = `range_max`) can only be silent or too near. Raises ValueError also for impossible limits.
+    """
+    stamp_ns, frame_id = wire.header()
+    wire.number("B")  # ultrasound or infrared: both are a cone
+    beam, least, most, distance = wire.numbers("f", 4)
+    variance = wire.number("f") if wire.left >= 4 else 0.0  # newer than ROS 2 Humble
+    if not (np.isfinite([beam, least, most]).all() and 0 <= least <= most and most > 0 and 0 <= beam <= np.pi):
+        raise ValueError(
+            f"a range between min_range {least:g} and max_range {most:g} with field_of_view {beam:g} is invalid"
+        )
+    if isfinite(distance):
+        distance = inf if distance == most else distance if least <= distance < most else nan
+    sigma = sqrt(variance) if 0 < variance < inf else 0.0
+    return RangeReading(stamp_ns, frame_id, distance, beam, least, most, sigma)
 
 
 @dataclass(frozen=True, eq=False)

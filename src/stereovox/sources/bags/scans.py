@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
+from math import inf, isfinite
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.sources.bags.files import BagFile
@@ -15,25 +19,36 @@ from stereovox.sources.bags.robot_messages import (
     CLOUDS,
     LASER_SCAN,
     ODOMETRY,
+    RANGE,
     LaserScan,
     PointCloud,
+    RangeReading,
     StampedTransform,
     frame_name,
     is_motion,
     read_laser_scan,
     read_odometry,
     read_point_cloud,
+    read_range,
 )
 from stereovox.sources.bags.tf import Edge
 
+ScanT = TypeVar("ScanT")
 SAMPLED = 5
 """Scans that are read for the notes."""
+SURVEYED = 20
+"""Scans, spread over a recording, in which a mark of "no echo" is sought."""
+TOP, GAP, SPIKE, FEWEST = 0.998, 0.75, 0.005, 20
+"""Marks of "no echo" are within 0.2 % of the largest range; this share of the beams, and so many of them at least, are
+there, and not one between three quarters of that range and it."""
+CONSTANT = 0.95
+"""Share of these that are the same number in scans whose limits are known: the wall behind a door never is."""
 MAX_ATTEMPTS = 5
 """Messages tried before a topic counts as unreadable."""
 
 
 class ScanTopic:
-    """Scans, or clouds, of one topic in order of recording.
+    """Scans, clouds or ranges of one topic in order of recording.
 
     frame_id: frame of the first readable one, "" if unnamed.
     """
@@ -57,10 +72,30 @@ class ScanTopic:
                 scans += [scan for scan in [self.read(i)] if isinstance(scan, LaserScan)]
         beyond = sum(scan.beyond for scan in scans)
         if not beyond:
-            return ()
+            return self._note_of_mark()
         share = f"{100 * beyond / sum(len(scan.ranges) for scan in scans):.0f} % of the ranges of {self.topic}"
         cure = f"if they mean that nothing is there, give ?range_max={scans[0].range_max:g}"
         return (f"{self.path}: {share} are beyond its range_max and are discarded; {cure}",)
+
+    def _note_of_mark(self) -> tuple[str, ...]:
+        if not isfinite(self._mark):
+            return ()
+        said = f"ranges of {self.topic} from {self._mark:.4g} m on are taken as a mark of no echo and are discarded"
+        return (f"{self.path}: {said}; if that is wrong, give ?range_max=",)
+
+    @cached_property
+    def _mark(self) -> float:
+        """Range from which on ranges are no measurements, although the scans' own limits allow them; inf if none."""
+        if self.is_cloud or self._kind == RANGE or self._range_max:
+            return inf
+        found = list[NDArray[np.float32]]()
+        for i in {*np.linspace(0, len(self) - 1, min(SURVEYED, len(self))).astype(int).tolist()}:
+            with suppress(ValueError, FrameRefused):
+                found.append(read_laser_scan(self._file.read(self.topic, i)).ranges)
+        ranges = np.concatenate([one[np.isfinite(one)] for one in found] or [np.empty(0, np.float32)])
+        mark = spike_of(ranges)
+        _, counts = np.unique(ranges[ranges >= (mark or inf)], return_counts=True)
+        return mark if mark and counts.max() >= CONSTANT * counts.sum() else inf
 
     def name(self, i: int) -> str:
         """Return the name of scan `i` for messages."""
@@ -78,17 +113,75 @@ class ScanTopic:
                 found.add(self._file.read(self.topic, i).header()[0] or self.recorded_ns(i))
         return sorted(found)
 
-    def read(self, i: int) -> LaserScan | PointCloud:
+    def topic_of(self, i: int) -> str:
+        """Return the topic of scan `i`."""
+        return self.topic
+
+    def read(self, i: int) -> LaserScan | PointCloud | RangeReading:
         """Return scan `i`, with the time of recording if it has none; raises FrameRefused `unreadable`."""
         wire = self._file.read(self.topic, i)
         try:
             if self.is_cloud:
                 message = read_point_cloud(wire, self._kind, self._period_s)
+            elif self._kind == RANGE:
+                message = read_range(wire)
             else:
-                message = read_laser_scan(wire, self._range_max)
+                message = _without_mark(read_laser_scan(wire, self._range_max), self._mark)
         except ValueError as error:
             raise FrameRefused("unreadable", f"{self.name(i)}: {error}; leave it out") from None
         return replace(message, stamp_ns=message.stamp_ns or self.recorded_ns(i), frame_id=frame_name(message.frame_id))
+
+
+def spike_of(ranges: NDArray[np.floating]) -> float:
+    """Return the range from which on ranges (N,), all finite, are only a mark of "no echo"; 0 if none are."""
+    largest = float(ranges.max(initial=0.0))
+    top, below = int((ranges >= TOP * largest).sum()), int((ranges >= GAP * largest).sum())
+    return TOP * largest if top == below >= max(SPIKE * len(ranges), FEWEST) else 0.0
+
+
+def _without_mark(scan: LaserScan, mark: float) -> LaserScan:
+    if not isfinite(mark):
+        return scan
+    return replace(scan, ranges=np.where(np.isfinite(scan.ranges) & (scan.ranges >= mark), np.nan, scan.ranges))
+
+
+class ScanTopics:
+    """Several topics of one kind as one, in order of recording; its members are those of `ScanTopic`."""
+
+    def __init__(self, topics: list[ScanTopic]):
+        self.topic, self.is_cloud = ",".join(one.topic for one in topics), topics[0].is_cloud
+        self.frame_id, self.notes = topics[0].frame_id, tuple(note for one in topics for note in one.notes)
+        self._topics = topics
+        self._order = sorted(
+            (one.recorded_ns(i), number, i) for number, one in enumerate(topics) for i in range(len(one))
+        )
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def name(self, i: int) -> str:
+        """Return the name of scan `i` for messages."""
+        return self._at(i, ScanTopic.name)
+
+    def recorded_ns(self, i: int) -> int:
+        """Return the time at which scan `i` was recorded."""
+        return self._order[i][0]
+
+    def taken_ns(self) -> list[int]:
+        """Return the times of all readable scans, ascending."""
+        return sorted({stamp_ns for one in self._topics for stamp_ns in one.taken_ns()})
+
+    def topic_of(self, i: int) -> str:
+        """Return the topic of scan `i`."""
+        return self._at(i, ScanTopic.topic_of)
+
+    def read(self, i: int) -> LaserScan | PointCloud | RangeReading:
+        """Return scan `i` as `ScanTopic.read` does."""
+        return self._at(i, ScanTopic.read)
+
+    def _at(self, i: int, of: Callable[[ScanTopic, int], ScanT]) -> ScanT:
+        _, number, k = self._order[i]
+        return of(self._topics[number], k)
 
 
 def find_scans(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.files.safe_io import is_number, read_table, shown, toml_text
-from stereovox.frame import AnyFrame, Cloud, Frame, StereoFrame
+from stereovox.frame import AnyFrame, Frame, Rays, StereoFrame
 from stereovox.sources.base import Changed, Stream
 from stereovox.sources.calibration.intrinsics import NAMES, Intrinsics, read_camera_numbers, scaled
 
@@ -152,11 +152,11 @@ class WithCamera(Changed):
         self.camera, self.notes = camera, (*self.notes, *notes)
 
     def change(self, frame: AnyFrame) -> Frame:
-        """Return a depth frame with the camera; raises SourceError for a stereo pair or a cloud."""
+        """Return a depth frame with the camera; raises SourceError for a stereo pair or rays."""
         if isinstance(frame, StereoFrame):
             raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
-        if isinstance(frame, Cloud):
-            raise SourceError(f"{self.name}: has clouds of a lidar, which no camera file fits; leave it out")
+        if isinstance(frame, Rays):
+            raise SourceError(f"{self.name}: has no images, which no camera file fits; leave it out")
         return replace(frame, camera=self.camera)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds and 2-D scans of bags: `drive.bag?cloud=/velodyne_points`, `drive.bag?scan=/scan`."""
+"""Clouds, 2-D scans and ranges of bags: `drive.bag?cloud=/points`, `drive.bag?scan=/scan`, `drive.bag?range=/sonar`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
+from stereovox.cameras.lidar import RangeSensor
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.frame import Cloud
+from stereovox.frame import Cloud, Range
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
 from stereovox.sources.bags.recording import PosedSensor, TurnedTf, file_part, read_poses
-from stereovox.sources.bags.robot_messages import CLOUDS, LASER_SCAN, LaserScan, PointCloud
-from stereovox.sources.bags.scans import ScanTopic, check_topic
+from stereovox.sources.bags.robot_messages import CLOUDS, LASER_SCAN, RANGE, LaserScan, PointCloud, RangeReading
+from stereovox.sources.bags.scans import ScanTopic, ScanTopics, check_topic
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.parameters import mounted
 
-TOPICS = {"cloud": CLOUDS, "scan": (LASER_SCAN,)}
+TOPICS = {"cloud": CLOUDS, "scan": (LASER_SCAN,), "range": (RANGE,)}
 MOUNT = "mount=x,y,z,yaw,pitch,roll of the lidar on it"
 
 
@@ -31,7 +32,9 @@ class Options(LidarOptions):
     """Those of all clouds (`LidarOptions`), and:
 
     cloud: topic of the clouds (`sensor_msgs/PointCloud2`, `PointCloud`, Livox's `CustomMsg`). scan: topic of scans
-    (`sensor_msgs/LaserScan`) to use instead. poses: topic or file of the lidar's poses, or of its body's; default: /tf.
+    (`sensor_msgs/LaserScan`) to use instead; range: of sonars or radars (`sensor_msgs/Range`). Several topics are
+    separated by commas. silence_clears: 1 if a cone in which nothing was heard is free (`RangeSensor`). poses: topic or
+    file of the lidar's poses, or of its body's; default: /tf.
     mount: where the lidar is on the posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians
     (0,0,0: the poses are the lidar's). world_frame: as for depth images. deskew: 0 to treat the points of a cloud as
     measured at once although they have times.
@@ -39,6 +42,8 @@ class Options(LidarOptions):
 
     cloud: str = ""
     scan: str = ""
+    range: str = ""
+    silence_clears: bool = False
     poses: str = ""
     mount: str = ""
     world_frame: str = ""
@@ -49,18 +54,18 @@ class Options(LidarOptions):
 
 
 class BagClouds(CloudSource):
-    """Clouds, or 2-D scans, of one topic of a bag, with poses from /tf or another topic.
+    """Clouds, 2-D scans or ranges of a bag, with poses from /tf or another topic.
 
-    where: the file, with `?cloud=/topic` or `?scan=/topic`; see `Options`.
+    where: the file, with `?cloud=/topic`, `?scan=/topic` or `?range=/topic`; see `Options`.
     Points: fields x, y and z. If they have times (`time`, `t`, `timestamp`, `offset_time`) they are deskewed with
         the poses of the sensor (`deskewed`). Of a scan: each beam's end; beams without an echo (+inf) are free up to
-        its `range_max`.
+        its `range_max`. A range is a `Range`: the arc of a cone about the frame's x axis.
     Pose: of the frame that the messages name, at their times.
     Faults: `unreadable`, `no_pose`, `bad_pose_file`.
     Raises SourceError for unusable files, topics that do not exist or have another type, and bad options.
     """
 
-    layout = "clouds of a bag (drive.bag?cloud=/topic) or its 2-D scans (?scan=/topic)"
+    layout = "clouds of a bag (drive.bag?cloud=/topic), its 2-D scans (?scan=/topic) or ranges (?range=/topic)"
 
     def __init__(self, where: str):
         path = file_part(where)
@@ -68,12 +73,11 @@ class BagClouds(CloudSource):
         no_others(where, others, Options)
         given = {key: topic for key in TOPICS if (topic := getattr(self._options, key))}
         if len(given) != 1:
-            raise SourceError(f"{where}: has {' and '.join(given)}; give one of ?cloud= and ?scan=")
-        ((key, topic),) = given.items()
+            raise SourceError(f"{where}: has {' and '.join(given)}; give one of ?cloud=, ?scan= and ?range=")
+        ((key, topics),) = given.items()
         self._file = open_bag(Path(path))
-        check_topic(self._file, topic, TOPICS[key], key)
-        self._scans = ScanTopic(self._file, topic, self._options.range_max)
-        self.name, self.lidar = f"{Path(path).name} {topic}", self._options.lidar
+        self._scans = self._topics(key, topics)
+        self.name, self.lidar = f"{Path(path).name} {topics}", self._options.lidar
         mount = mounted("mount", self._options.mount)
         self._T_body_lidar = np.eye(4) if mount is None else mount
         options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame)
@@ -83,9 +87,16 @@ class BagClouds(CloudSource):
         self.notes = (*self._file.notes, *notes, *self._note_of_times(), *self._scans.notes)
         self.posed = self._poses is not None
 
+    def _topics(self, key: str, names: str) -> ScanTopic | ScanTopics:
+        found = list[ScanTopic]()
+        for topic in names.split(","):
+            check_topic(self._file, topic, TOPICS[key], key)
+            found.append(ScanTopic(self._file, topic, self._options.range_max))
+        return found[0] if len(found) == 1 else ScanTopics(found)
+
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a bag with an option for clouds or scans."""
+        """Return whether `where` is a bag with an option for clouds, scans or ranges."""
         file = file_part(where)
         asked = [word.partition("=")[0] for word in where[len(file) :].lstrip("?").split("&")]
         return bool(set(asked) & set(TOPICS)) and bool(suffix_of(file))
@@ -101,20 +112,24 @@ class BagClouds(CloudSource):
         """Return its message."""
         return self._scans.name(i)
 
-    def cloud(self, i: int) -> Cloud:
-        """Return cloud `i`, deskewed if its points have times."""
+    def cloud(self, i: int) -> Cloud | Range:
+        """Return cloud `i`, deskewed if its points have times; of a topic of ranges, the range."""
         message = self._scans.read(i)
         pose_at = partial(self._pose_at, message.frame_id)
         T = pose_at(message.stamp_ns)
-        if isinstance(message, LaserScan):
+        if isinstance(message, RangeReading):
+            found = range_of_reading(message, self._options.sigma, self._options.silence_clears)
+        elif isinstance(message, LaserScan):
             found = cloud_of_scan(message, self._options)
         else:
             found = Cloud(message.points, T, lidar=self.lidar)
         found = replace(
-            found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic,
+            found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic_of(i),
             pose_off_ns=self._off_ns(message.frame_id, message.stamp_ns),
         )  # fmt: skip
         times = None
+        if isinstance(found, Range):
+            return found
         if isinstance(message, PointCloud) and self._options.deskew:
             if message.fault:
                 detail = f"{self.file(i)}: {message.fault}; add ?deskew=0 for clouds measured at once"
@@ -166,6 +181,22 @@ class BagClouds(CloudSource):
         if isinstance(message, PointCloud) and message.times_s is None and not message.fault:
             return (f"{self.name}: its points have no times, so each cloud counts as measured at once",)
         return ()
+
+
+def range_of_reading(reading: RangeReading, sigma: float = 0.0, silence_clears: bool = False) -> Range:
+    """Return a reading as a range, without a pose.
+
+    Args:
+        reading: The reading. Without a field of view it has the usual cone of a `RangeSensor`.
+        sigma: Standard deviation in metres; 0: the reading's, else the usual one.
+        silence_clears: As in `RangeSensor`.
+    """
+    usual = RangeSensor()
+    least = reading.range_min if reading.range_min < reading.range_max else 0.0  # a sensor of a fixed distance
+    beam = RangeSensor(
+        sigma or reading.sigma or usual.sigma, least, reading.range_max, reading.beam or usual.beam, silence_clears
+    )
+    return Range(reading.distance, np.full((4, 4), np.nan), reading.stamp_ns, beam)
 
 
 def cloud_of_scan(scan: LaserScan, options: LidarOptions | None = None) -> Cloud:

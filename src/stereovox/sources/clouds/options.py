@@ -13,7 +13,7 @@ import numpy as np
 
 from stereovox.cameras.lidar import Lidar
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.frame import FORWARD, Cloud
+from stereovox.frame import FORWARD, Cloud, Range
 from stereovox.sources import parameters
 from stereovox.sources.base import Source
 
@@ -82,7 +82,7 @@ class CloudSource(Source):
     camera: Any = FORWARD
 
     @abstractmethod
-    def cloud(self, i: int) -> Cloud:
+    def cloud(self, i: int) -> Cloud | Range:
         """Return cloud number `i`, from 0; raises FrameRefused if it cannot be used."""
         ...
 
@@ -96,7 +96,7 @@ class CloudSource(Source):
         """Return its origin, for messages."""
         ...
 
-    def frame(self, i: int) -> Cloud:
+    def frame(self, i: int) -> Cloud | Range:
         """Return cloud `i`; if it has a `fault`, it has no points and a pose of NaN."""
         i = range(len(self))[i]
         try:

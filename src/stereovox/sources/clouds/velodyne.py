@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.frame import Cloud, StereoFrame
+from stereovox.frame import AnyFrame, Cloud
 from stereovox.sources.base import Source
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, options_of
 from stereovox.sources.kitti.base import KittiSource
@@ -106,7 +106,7 @@ class CameraAndVelodyne(Source):
     def __len__(self) -> int:
         return 2 * len(self._clouds)
 
-    def frame(self, i: int) -> StereoFrame | Cloud:
+    def frame(self, i: int) -> AnyFrame:
         """Return frame `i`."""
         number, turn = divmod(range(len(self))[i], 2)
         return (self._clouds if turn else self._clouds.drive).frame(number)

@@ -17,7 +17,7 @@ from stereovox.sources.bags.depth_topic import DepthTopic, depth_topics, find_de
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.poses import topic_poses
 from stereovox.sources.bags.recording import depth_frame, file_part, parse_as
-from stereovox.sources.bags.robot_messages import LaserScan, frame_name
+from stereovox.sources.bags.robot_messages import LaserScan, PointCloud, frame_name
 from stereovox.sources.bags.scans import busiest_topic, find_scans
 from stereovox.sources.bags.tf import Limits
 from stereovox.sources.base import Lazy
@@ -154,6 +154,7 @@ class RobotBag:
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
         if isinstance(message, LaserScan):
             return posed_scan(message, T_odom, T_base, blank.name, off_ns)
+        assert isinstance(message, PointCloud)
         band = CloudBand(self._options.lowest, self._options.highest)
         band = replace(band, range_max=self._options.range_max or band.range_max)
         flat, T_base_scan = scan_of_cloud(message, T_base, band)

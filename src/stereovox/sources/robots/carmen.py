@@ -20,14 +20,12 @@ from stereovox.frame import Frame, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se2 import lifted
 from stereovox.sources import parameters
+from stereovox.sources.bags.scans import spike_of
 from stereovox.sources.poses.poses import Poses
 
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
 """Line types with a scan of the front laser, and the largest distance in metres of its mount from the robot."""
 NO_ECHO = (50.0, 81.9)
-TOP, GAP, SPIKE, FEWEST = 0.998, 0.75, 0.005, 20
-"""Other marks of "no echo" are within 0.2 % of the largest range of a log; this share of its beams, and so many of them
-at least, are there, and not one between three quarters of that range and it."""
 MAX_DISTANCE = 1e6
 """Limit in metres for the robot's distance from the world's origin."""
 MAX_BEAMS = 100_000
@@ -260,9 +258,7 @@ def _no_echo(readings: list[Reading], declared: float) -> float:
     known = min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=0.0)
     if known and not declared:
         return known
-    top, below = int((ranges >= TOP * largest).sum()), int((ranges >= GAP * largest).sum())
-    spike = top == below >= max(SPIKE * len(ranges), FEWEST)
-    return min(TOP * largest if spike else declared or NO_ECHO[-1], declared or np.inf)
+    return min(spike_of(ranges) or declared or NO_ECHO[-1], declared or np.inf)
 
 
 def _notes(path: Path, damaged: list[str], max_range: float, no_echo: str) -> Iterator[str]:

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from stereovox.products.distance import DistanceField as DistanceField
     from stereovox.products.floor.ground import ground as ground
     from stereovox.products.floor.level_ways import LevelPlanner as LevelPlanner
+    from stereovox.products.floor.level_ways import Waypoints as Waypoints
     from stereovox.products.frontiers import frontiers as frontiers
     from stereovox.products.path_check import check_path as check_path
     from stereovox.ros.nav2 import write_nav2 as write_nav2
@@ -142,6 +143,7 @@ _HOMES = {
     "import_map": "formats",
     "DistanceField": "products.distance",
     "LevelPlanner": "products.floor.level_ways",
+    "Waypoints": "products.floor.level_ways",
     "check_path": "products.path_check",
     "coarsen": "products.coarsen",
     "crop": "products.crop",

@@ -98,6 +98,16 @@ def test_cut_off_messages_are_refused_at_any_length():
     assert mapper.map.history.refused["unreadable"] == len(lengths)
 
 
+def test_an_image_of_another_camera_on_the_topic_is_refused():
+    """The camera, and its pose, are those of the first one's frame."""
+    one = depth_input()
+    assert one.frame(wire.image(DEPTH, 5, "eye"), there).fault is None
+    other = one.frame(wire.image(DEPTH, 6, "other_eye"), there)
+    assert other.fault == "no_pose"
+    assert "'other_eye'" in other.fault_detail
+    assert one.frame(wire.image(DEPTH, 7, "/eye"), there).fault is None
+
+
 def test_without_camera_or_pose_nothing_is_mapped():
     report = Mapper("default").add(DepthInput("/d/image").frame(wire.image(DEPTH), there))
     assert report.refused == "no_camera"

@@ -148,7 +148,10 @@ def test_what_is_published_is_what_the_map_says(robot):
         stamps = [robot.came[topic][-1].header.stamp if robot.came[topic] else None for topic in topics]
         return all(stamp and stamp.sec * 10**9 + stamp.nanosec == last_ns for stamp in stamps)
 
-    robot.until(lambda: all_came() and len(robot.came["/diagnostics"]) > 1)
+    def diagnosed():
+        return {pair.key: pair.value for one in robot.came["/diagnostics"][-1:] for pair in one.status[0].values}
+
+    robot.until(lambda: all_came() and diagnosed().get("frames_in_map") == "4")
     voxel_map = robot.mapping.snapshot()()
     grid, cloud, *octomap = (robot.came[topic][-1] for topic in topics)
     assert {one.header.frame_id for one in (grid, cloud, *octomap)} == {"odom"}
@@ -159,9 +162,7 @@ def test_what_is_published_is_what_the_map_says(robot):
     assert [(field.name, field.offset) for field in cloud.fields][-1] == ("probability", 12)
     for message in octomap:
         check_octomap(message, voxel_map)
-    values = {pair.key: pair.value for pair in robot.came["/diagnostics"][-1].status[0].values}
-    assert values["frames_in_map"] == "4"
-    assert values["received"] == "4"
+    assert diagnosed()["received"] == "4"
     levels = {one.status[0].message.partition(":")[0]: one.status[0].level for one in robot.came["/diagnostics"]}
     assert levels.items() <= {"waiting": b"\1", "current": b"\0", "stale": b"\3"}.items()
 

@@ -21,7 +21,7 @@ from stereovox.frame import Cloud, Frame, Range, Scan
 from stereovox.geometry.se3 import inverse
 from stereovox.ros.poses.poses import Pose, PoseBuffer
 from stereovox.sources.bags.compressed_depth import SUFFIXES, plain_topic
-from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
+from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, check_frame, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
 from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud, read_range
 from stereovox.sources.clouds.bag import cloud_of_scan, range_of_reading
@@ -85,6 +85,7 @@ class DepthInput(Input):
         self.kind = "sensor_msgs/CompressedImage" if self._packed else "sensor_msgs/Image"
         self.info = info or sibling(plain_topic(topic), "camera_info")
         self._camera: PinholeCamera | None = None
+        self._frame_id = ""
         self._trouble = f"{topic}: no camera_info on {self.info}; name its topic: --depth {topic}=INFO"
 
     @property
@@ -113,6 +114,8 @@ class DepthInput(Input):
         try:
             stamp_ns, frame_id = header(data)
             blank = replace(blank, stamp_ns=stamp_ns, name=_frame_title(self.topic, stamp_ns))
+            check_frame(frame_id, self._frame_id, blank.name)
+            self._frame_id = frame_id
             if self._camera is None:
                 raise FrameRefused("no_camera", self._trouble)
             wire, size = Wire(data, cdr=True), (self._camera.width, self._camera.height)

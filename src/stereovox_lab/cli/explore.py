@@ -24,10 +24,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mission",
-        choices=("frontiers", "middle"),
+        choices=("frontiers", "middle", "waypoints"),
         default="frontiers",
-        help="explore until no frontier can be reached, or find the middle of the room and look around (%(default)s)",
+        help="explore until no frontier can be reached, find the middle of the room and look around, or visit "
+        "--waypoints and return (%(default)s)",
     )
+    parser.add_argument("--waypoints", metavar="X,Y;...", default="", help="places to visit, in metres, in order")
     parser.add_argument("--seeds", default="0:5", metavar="A:B", help="starts, each flown in each scene (%(default)s)")
     parser.add_argument("--seconds", type=float, default=300.0, metavar="S", help="longest flight (%(default)s)")
     parser.add_argument("--speed", type=float, default=0.6, metavar="M/S", help="along paths, m/s (%(default)s)")
@@ -69,6 +71,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
             arguments.mission,
             seeds,
             cruise,
+            waypoints=_places(arguments.waypoints),
             jobs=arguments.jobs,
             maps=folder,
             progress=progress,
@@ -81,6 +84,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
     files = report.write_missions(folder, result)
     say(f"written: {', '.join([*files.values(), *result['maps']])}")
     return {**result, "files": files}
+
+
+def _places(text: str) -> list[tuple[float, float]]:
+    try:
+        return [(float(x), float(y)) for x, y in (one.split(",") for one in text.split(";") if one.strip())]
+    except ValueError:
+        raise StereovoxError(f"--waypoints {text}: give X,Y of each place in metres, such as '2,1;4,-1.5'") from None
 
 
 def _seeds(text: str) -> range:

@@ -14,11 +14,18 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
+from stereovox.products.floor.level_ways import Waypoints
 from stereovox.simulate.simulation import Simulation
 from stereovox_lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, Mission, fly
 from stereovox_lab.flights.flight import World
 
-MISSIONS: dict[str, Callable[[], Mission]] = {"frontiers": Frontiers, "middle": MiddleOfRoom}
+Places = tuple[tuple[float, float], ...]
+WAYPOINTS = "waypoints"
+MISSIONS: dict[str, Callable[[Places], Mission]] = {
+    "frontiers": lambda places: Frontiers(),
+    "middle": lambda places: MiddleOfRoom(),
+    WAYPOINTS: lambda places: Waypoints(np.array(places)),
+}
 SCENES = ("sim:hall?plan={seed}",)
 IMAGE_WIDTH = 212
 """Default image width in pixels."""
@@ -31,6 +38,7 @@ class _Flight:
     scene: str
     seed: int
     mission: str
+    waypoints: Places
     cruise: Cruise
     save: Path | None
 
@@ -41,6 +49,7 @@ def explore(
     seeds: Iterable[int] = range(10),
     cruise: Cruise | None = None,
     *,
+    waypoints: Sequence[tuple[float, float]] = (),
     jobs: int = 1,
     maps: str | Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
@@ -52,9 +61,10 @@ def explore(
         scenes: Simulations (`sim:...`); `{seed}` in them is replaced by the flight's seed. Images are 212 pixels wide
             unless a scene gives `image_width`.
         mission: `frontiers`: explore until no frontier can be reached; `middle`: find the middle of the room and look
-            round there (Chien 2020, 5.1).
+            round there (Chien 2020, 5.1); `waypoints`: visit the places and return (`stereovox.Waypoints`).
         seeds: Of start, heading and noise; each is flown in each scene.
         cruise: Flight settings; its `scene` is ignored. By default `Cruise()`.
+        waypoints: x, y in metres of the places of that mission.
         jobs: Processes; with more than one, call this under `if __name__ == "__main__":`. The result is the same.
         maps: Folder for the map of each scene's first flight; None: maps are not kept.
         progress: Called with flights done, all flights, and the current one.
@@ -70,9 +80,12 @@ def explore(
     """
     cruise, numbers = cruise or Cruise(), [int(seed) for seed in seeds]
     _check(scenes, mission, numbers, cruise, jobs)
+    places = tuple((float(x), float(y)) for x, y in waypoints)
+    if bool(places) != (mission == WAYPOINTS):
+        raise StereovoxError("way-points and the mission `waypoints` need each other; give both")
     folder = None if maps is None else Path(maps)
     flights = [
-        _Flight(_narrow(scene), seed, mission, cruise, _map_of(folder, i) if seed == numbers[0] else None)
+        _Flight(_narrow(scene), seed, mission, places, cruise, _map_of(folder, i) if seed == numbers[0] else None)
         for i, scene in enumerate(scenes)
         for seed in numbers
     ]
@@ -146,7 +159,7 @@ def _flown(flights: Sequence[_Flight], jobs: int) -> Iterator[dict[str, Any]]:
 
 def _fly(flight: _Flight) -> dict[str, Any]:
     world = World(flight.scene.format(seed=flight.seed))
-    explored, voxel_map = fly(flight.seed, MISSIONS[flight.mission](), flight.cruise, world)
+    explored, voxel_map = fly(flight.seed, MISSIONS[flight.mission](flight.waypoints), flight.cruise, world)
     if flight.save is not None:
         flight.save.parent.mkdir(parents=True, exist_ok=True)
         voxel_map.save(flight.save)

@@ -13,7 +13,7 @@ from made_robot_bags import MS, START_NS, RobotBagMaker, planar_motion, planar_n
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.geometry.se3 import inverse
-from stereovox.opening import open_robot
+from stereovox.opening import open_robot, open_source
 from stereovox.sources.robots.bag import RobotBag, mounted
 from stereovox.sources.robots.robot import in_time_order
 
@@ -539,3 +539,18 @@ def test_the_wall_behind_a_door_is_no_mark(tmp_path):
 
     robot = RobotBag(made(tmp_path / "a.bag", mounts, drive, scans))
     assert all(np.isfinite(scan.ranges).all() for scan in robot.scans)
+
+
+@ENDINGS
+def test_an_image_of_another_camera_on_the_topic_has_no_pose(tmp_path, ending):
+    def images(bag: RobotBagMaker) -> None:
+        for k, frame_id in enumerate(("optical", "rear", "optical")):
+            stamp = START_NS + k * 100 * MS
+            pixels = 1000 + np.arange(48, dtype=np.uint16).reshape(6, 8)
+            bag.add("/camera/depth/image", "sensor_msgs/Image", stamp, bag.image(stamp, pixels, frame_id))
+            bag.add("/camera/depth/camera_info", "sensor_msgs/CameraInfo", stamp, bag.camera_info(stamp, 8, 6))
+
+    path = made(tmp_path / f"a{ending}", mounts, drive, images)
+    for frames in (RobotBag(path).frames, list(open_source(path))):
+        assert [frame.fault for frame in frames] == [None, "no_pose", None]
+        assert "it is in frame 'rear', the camera of its topic in 'optical'" in frames[1].fault_detail

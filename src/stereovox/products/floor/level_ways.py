@@ -1,21 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths of a vehicle at one height through known free space, and the middle of that space."""
+"""Paths of a vehicle at one height through known free space, the middle of that space, and a tour of way-points."""
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.files.safe_io import shown
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.query.queries import points_of
+from stereovox.products.frontiers import frontiers
 
 CLEAR = 0.3
 """A step costs its length times 1 + this (metres) over the clearance: paths keep to the middle."""
 SIDES = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Steps to neighbours; each also counts in reverse."""
+NEARER_M, SAME_M, TRIES = 0.3, 0.6, 3
+"""A path towards a way-point ends nearer to it than all before by this much, or leads to a frontier that is this far
+from all that were looked at. A way-point to which this many known paths had to be abandoned is given up."""
+FRONTIER_CELLS, BAND = 15, 0.6
+"""Fewest cells of a frontier on the way, and metres above and below the vehicle in which it is sought."""
+NO_PATH, ABANDONED = "no path to it", "paths to it abandoned"
+"""Reasons why a way-point was given up."""
 
 
 class LevelPlanner:
@@ -127,6 +137,113 @@ class LevelPlanner:
         """Return the middles (..., 3) of columns (..., 2) at the start's height."""
         flat = (columns + self._first[:2] + 0.5) * self._cell[:2]
         return np.concatenate([flat, np.full((*flat.shape[:-1], 1), self.start[2])], axis=-1)
+
+
+class Waypoints:
+    """A tour of places, and the path home, through space that is known to be free.
+
+    The loop that flies or drives calls `next` once the vehicle has stopped: at the end of a path, or where it had to be
+    abandoned. A place that no known path reaches is approached, and explored for, until nothing is left to look at.
+
+    Args:
+        places: (N, 2) or (N, 3) metres in the map's frame, in order; heights are ignored.
+        near: Metres within which a place counts as reached.
+        home: Whether to return to the place of the first call.
+
+    Attributes:
+        reached: For each place, whether it was reached.
+        is_home: Whether the tour ended at home.
+        left: Number of places given up, home included, by reason.
+
+    Raises:
+        StereovoxError: The places have another shape or are not finite, or `near` is not above 0.
+    """
+
+    def __init__(self, places: ArrayLike, near: float = 0.3, home: bool = True):
+        try:
+            goals = np.asarray(places, float)
+        except (TypeError, ValueError):
+            raise StereovoxError(f"way-points {shown(places)}: give (N, 2) or (N, 3) metres") from None
+        if goals.ndim != 2 or goals.shape[1] not in (2, 3) or not np.isfinite(goals).all():
+            raise StereovoxError(f"way-points of shape {goals.shape}: give (N, 2) or (N, 3) finite metres")
+        if not 0 < near < np.inf:
+            raise StereovoxError(f"near {near}: give metres above 0")
+        self.reached, self.is_home, self.left = [False] * len(goals), False, dict[str, int]()
+        self._goals, self._near, self._returns, self._began = list(goals[:, :2]), near, home, False
+        self._current, self._tries, self._best = 0, 0, np.inf
+        self._looked: list[NDArray[np.float64]] = []
+
+    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the next path.
+
+        Args:
+            voxel_map: The map, as it is now.
+            ways: A planner on it, whose start is the vehicle's position.
+
+        Returns:
+            The path (N, 3) in metres, and the place (3,) to look at from its end, NaN to look all around; None once the
+            tour is done.
+        """
+        if not self._began:
+            self._began = True
+            self._goals += [ways.start[:2].copy()] * self._returns
+        while self._current < len(self._goals):
+            goal = self._goals[self._current]
+            if np.linalg.norm(ways.start[:2] - goal) <= self._near:
+                self._arrive()
+            elif (found := self._towards(goal, voxel_map, ways)) is not None:
+                return found
+            else:
+                reason = ABANDONED if self._tries >= TRIES else NO_PATH
+                self.left = dict(Counter(self.left) + Counter([reason]))
+                self._go_on()
+        return None
+
+    def _arrive(self) -> None:
+        if self._current < len(self.reached):
+            self.reached[self._current] = True
+        else:
+            self.is_home = True
+        self._go_on()
+
+    def _go_on(self) -> None:
+        self._current, self._tries, self._best, self._looked = self._current + 1, 0, np.inf, []
+
+    def _towards(
+        self, goal: NDArray[np.float64], voxel_map: VoxelMap, ways: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the path to a place, or one after which more is known of the way there; None to give it up."""
+        target = np.array([*goal, ways.start[2]])
+        if (path := ways.path_to(target, self._near)) is not None:
+            self._tries += 1
+            return (path, target) if self._tries <= TRIES else None
+        path = ways.path_to(target, np.inf)
+        if path is not None and (away := float(np.linalg.norm(path[-1][:2] - goal))) < self._best - NEARER_M:
+            self._best = away
+            return path, target
+        return self._explore(target, voxel_map, ways)
+
+    def _explore(
+        self, target: NDArray[np.float64], voxel_map: VoxelMap, ways: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return the path to the frontier by which the way to a place is shortest, of those not looked at."""
+        height = ways.start[2]
+        found = frontiers(
+            voxel_map, FRONTIER_CELLS, heights=(0.0, 2 * BAND), floor=height - BAND, start=ways.start, radius=0.2
+        )
+        best, shortest = None, np.inf
+        for one in found:
+            if any(np.linalg.norm(one.centroid - place) < SAME_M for place in self._looked):
+                continue
+            path = None if one.look_from is None else ways.path_to(one.look_from, NEARER_M)
+            if path is None:
+                continue
+            length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() + np.linalg.norm(one.centroid - target)
+            if length < shortest:
+                best, shortest = (path, one.centroid), length
+        if best is not None:
+            self._looked.append(best[1])
+        return best
 
 
 def _room(free: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:

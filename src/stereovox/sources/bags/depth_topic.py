@@ -25,7 +25,7 @@ from stereovox.sources.bags.messages import (
     read_pairs,
     read_value,
 )
-from stereovox.sources.bags.robot_messages import CLOUDS
+from stereovox.sources.bags.robot_messages import CLOUDS, frame_name
 from stereovox.sources.calibration.intrinsics import scaled
 
 PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
@@ -85,14 +85,23 @@ class DepthTopic:
     def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
         """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
 
-        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, with `name` in the message.
+        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, and `no_pose` for an image of another camera, with
+        `name` in the message.
         """
         picture = read_picture(self._file, self.topic, i, name)
+        check_frame(picture.frame_id, self.frame_id, name)
         packed = self._file.types[self.topic] == COMPRESSED
         depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
         stamp_ns, info = self._time(i, picture)
         unit = picture.depth_units or _positive(info.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
+
+
+def check_frame(frame_id: str, expected: str, name: str) -> None:
+    """Raise FrameRefused `no_pose` for an image in another frame than its topic's first one ("": unknown)."""
+    if expected and frame_name(frame_id) != frame_name(expected):
+        said = f"it is in frame '{frame_name(frame_id)}', the camera of its topic in '{frame_name(expected)}'"
+        raise FrameRefused("no_pose", f"{name}: {said}; give each camera a topic of its own")
 
 
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:

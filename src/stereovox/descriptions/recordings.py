@@ -24,6 +24,7 @@ from stereovox.runs.survey import LEVEL_ENOUGH, TILTED, Survey, UpEstimate, surv
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
+from stereovox.sources.bags.robot_messages import CLOUDS, POINT_CLOUD, RANGE
 from stereovox.sources.rgbd.layouts.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
 from stereovox.track.tracker import POSE_FAULTS
@@ -35,7 +36,7 @@ WITHOUT_IMAGES = {"cloud": "points", "range": "ranges"}
 """Kinds of frames in words."""
 MAX_RATE_HZ = 2000.0
 """Frames a second beyond which the stamps of a recording are wrong."""
-MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/PointCloud2")
+MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", POINT_CLOUD)
 
 
 def describe_recording(path: str) -> Description | None:
@@ -228,7 +229,7 @@ def _bag(path: str) -> Description:
         lines.append(f"  and {len(topics) - MAX_TOPICS} more (all with --json)")
     facts: dict[str, Any] = {"kind": "bag", "topics": topics}
     commands: list[str] = []
-    for part in (_bag_depth, _bag_robot, _bag_maps):
+    for part in (_bag_depth, _bag_robot, _bag_clouds, _bag_maps):
         part(path, file, lines, facts, commands)
     if not commands:
         lines.append("no topic here makes a map: it takes depth images with poses, scans, clouds, or a map")
@@ -275,9 +276,30 @@ def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
     commands += found.commands
 
 
+def _bag_clouds(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
+    """Add the clouds and ranges that have poses, or why they have none."""
+    for topic, kind in sorted(file.types.items()):
+        option = "cloud" if kind in CLOUDS else "range" if kind == RANGE else ""
+        if not option or len(file.stamps(topic)) < 2:  # a single cloud is a map
+            continue
+        where = f"{file_part(path)}?{option}={topic}"
+        try:
+            found = survey(open_source(where))
+        except StereovoxError as error:
+            lines.append(f"{topic} cannot be mapped: {without_name(error, where)}")
+            continue
+        facts.setdefault("clouds", {})[topic] = survey_facts(found)
+        lines += _survey_lines(found)
+        if found.posed:
+            commands += survey_commands(where, found)
+        else:
+            lines.append(f"give the poses of {topic} with &poses=FILE")
+
+
 def _bag_maps(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
     """Add the maps and clouds that can be imported."""
     for topic, kind in sorted(file.types.items()):
-        if kind in MAPS_IN_BAGS:
+        is_mapped = facts.get("clouds", {}).get(topic, {}).get("posed")
+        if kind in MAPS_IN_BAGS and not is_mapped:
             out = map_name(path, ".yaml" if kind == "nav_msgs/OccupancyGrid" else ".svox")
             commands.append(command_line("import", file_part(path), out, "--topic", topic))

@@ -125,6 +125,7 @@ OUTPUTS: dict[str, Leaves] = {
     "sv.check_path": Leaves(WORLD, SPACE, NO_FLOOR, MAP, JUDGED, "refuses: blocks the path"),
     "sv.frontiers": Leaves(WORLD, "carries along: the setting `up`", FLOOR_2D, OFFLINE, JUDGED, "uses: it is the goal"),
     "sv.LevelPlanner": Leaves(WORLD, "carries along: layers of the map", NO_FLOOR, OFFLINE, JUDGED, "refuses: no way"),
+    "sv.Waypoints": Leaves(WORLD, "carries along: layers of the map", NO_FLOOR, OFFLINE, JUDGED, "refuses: no way"),
     "sv.DistanceField": Leaves(WORLD, SPACE, NO_FLOOR, OFFLINE, JUDGED, "carries along: as its argument says"),
     "sv.ground": Leaves(WORLD, LEVEL, "uses: it is what is found", OFFLINE, JUDGED, "carries along: UNKNOWN footing"),
     "sv.coarsen": WHOLE,

@@ -24,13 +24,13 @@ COMMANDS = {
 
 MOST = {
     "modules": 610,
-    "lines": 93_700,
+    "lines": 94_100,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 86,
     "lines of the laboratory": 12_850,
-    "words of README and docs": 38_250,
+    "words of README and docs": 37_950,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""
 HABITS = {

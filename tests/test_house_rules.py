@@ -24,7 +24,7 @@ COMMANDS = {
 
 MOST = {
     "modules": 610,
-    "lines": 94_100,
+    "lines": 93_900,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

@@ -103,7 +103,7 @@ def test_an_image_of_another_camera_on_the_topic_is_refused():
     one = depth_input()
     assert one.frame(wire.image(DEPTH, 5, "eye"), there).fault is None
     other = one.frame(wire.image(DEPTH, 6, "other_eye"), there)
-    assert other.fault == "no_pose"
+    assert other.fault == "no_camera"
     assert "'other_eye'" in other.fault_detail
     assert one.frame(wire.image(DEPTH, 7, "/eye"), there).fault is None
 
@@ -217,7 +217,7 @@ def test_a_range_enters_maps_as_a_cone(mapper):
     assert 0 < arc < 0.7
     assert numbers[2:].tolist() == [0, 0]  # unknown
     assert mapper.add(one.frame(range_message(4.0, 2 * 10**9), there)).refused == "no_valid_range"  # silence
-    assert mapper.add(RangeInput("/s", True).frame(range_message(4.0, 3 * 10**9), there)).refused is None
+    assert mapper.add(RangeInput("/s", silence_clears=True).frame(range_message(4.0, 3 * 10**9), there)).refused is None
     for bad in ({"field_of_view": -1.0}, {"min_range": 5.0}, {"max_range": np.nan}):
         assert mapper.add(one.frame(range_message(1.0, **bad), there)).refused == "unreadable"
     assert one.frame(range_message(1.0)[:30], there).fault == "unreadable"

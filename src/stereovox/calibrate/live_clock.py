@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stereovox.calibrate.tracker import PoseTrack
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import AnyFrame, Cloud, Scan, name_of
+from stereovox.frame import AnyFrame, Rays, Scan, name_of
 from stereovox.geometry.se3 import Transform, apart
 from stereovox.sources.poses.clock_watch import CLOCK, LATE, START_NS, ClockDoubt, ClockWatch, Delays, Heard
 from stereovox.sources.poses.poses import Poses
@@ -230,8 +230,8 @@ class CameraClock:
         """Track an image during a doubt, and end the doubt once its motion decides it; notify the user of both."""
         if doubt is not self._doubt:
             self._doubt, self._motion, self._failed, self._told_ns = doubt, None, "", now_ns
-        if isinstance(frame, Cloud | Scan):
-            self._failed = "clouds and scans do not show it"
+        if isinstance(frame, Rays | Scan):
+            self._failed = "clouds, ranges and scans do not show it"
         if not doubt.told and (doubt.announced or now_ns - doubt.since_ns > TELL_NS):
             doubt.told, self._told_ns = True, now_ns
             self._notify(f"{self._name}: {doubt_words(doubt)}; images are left out while it moves; {self._cure(doubt)}")
@@ -239,7 +239,7 @@ class CameraClock:
             self._told_ns = now_ns
             why = self._failed or "its motion does not show it"
             self._notify(f"{self._name}: {doubt_words(doubt)}, and {why}; {self._cure(doubt)}")
-        if isinstance(frame, Cloud | Scan) or (self._seeing is not None and not self._seeing.done()):
+        if isinstance(frame, Rays | Scan) or (self._seeing is not None and not self._seeing.done()):
             return
         if self._motion is None:
             self._motion = MotionClock(self.config, self._mount, self._poses)

@@ -31,7 +31,7 @@ class DepthPipeline:
             return frame  # `prepare` validates its fields
         if isinstance(frame, Rays):
             validate_fields(frame, type(frame))
-            detail = "is no image: it can be mapped with given poses, but not tracked"
+            detail = "is not an image: it can be mapped with given poses, but not tracked"
             raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
         validate_fields(frame, StereoFrame, Frame)
         assert isinstance(frame, StereoFrame)

@@ -23,8 +23,9 @@ GOLDEN = pi * (3 - sqrt(5))
 
 
 def cloud_of(seen: Rays, config: Config) -> Cloud:
-    """Return the rays of a cone: to its arc at the distance, or free ones up to where nothing was heard; a cloud as it
-    is.
+    """Return the rays of a cone: to its arc at the distance, or free ones up to where nothing was heard.
+
+    A cloud is returned unchanged.
 
     Rays instead of an integrator of its own: limits, noise, cells, threads and all checks are those of clouds, whose
     kernel already lets a cell that holds an end outweigh whatever passes it.

@@ -22,9 +22,11 @@ from stereovox.errors import NoPoses, StereovoxError, without_name
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.runs.survey import LEVEL_ENOUGH, TILTED, Survey, UpEstimate, survey
 from stereovox.sources.bags import open_bag, suffix_of
+from stereovox.sources.bags.depth_topic import depth_topics
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
 from stereovox.sources.bags.robot_messages import CLOUDS, POINT_CLOUD, RANGE
+from stereovox.sources.bags.scans import frame_id_of
 from stereovox.sources.rgbd.layouts.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
 from stereovox.track.tracker import POSE_FAULTS
@@ -32,8 +34,9 @@ from stereovox.track.tracker import POSE_FAULTS
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
 IN_WORDS = {"depth": "depth image", "stereo": "stereo pair", "cloud": "cloud", "range": "range"}
-WITHOUT_IMAGES = {"cloud": "points", "range": "ranges"}
 """Kinds of frames in words."""
+WITHOUT_IMAGES = {"cloud": "points", "range": "ranges"}
+"""Kinds of frames that are no images, and what they consist of."""
 MAX_RATE_HZ = 2000.0
 """Frames a second beyond which the stamps of a recording are wrong."""
 MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", POINT_CLOUD)
@@ -159,11 +162,13 @@ def _survey_lines(found: Survey) -> list[str]:
 
 
 def _pose_lines(found: Survey) -> list[str]:
+    if found.kind in WITHOUT_IMAGES and not found.posed:
+        return [f"no sampled frame has a pose, and {found.kind}s cannot be tracked"]
     if not found.posed or found.extent_m is None:
         return ["no sampled frame has a pose: map tracks the camera by visual odometry, as track does"]
     share = "all" if found.posed == found.read else f"{found.posed} of {found.read}"
     return [
-        f"{share} sampled frames have poses; the camera moves within {metres(found.extent_m)}",
+        f"{share} sampled frames have poses; the sensor moves within {metres(found.extent_m)}",
         *([] if found.up is None else [_up_line(found.up)]),
     ]
 
@@ -277,23 +282,29 @@ def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
 
 
 def _bag_clouds(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
-    """Add the clouds and ranges that have poses, or why they have none."""
-    for topic, kind in sorted(file.types.items()):
-        option = "cloud" if kind in CLOUDS else "range" if kind == RANGE else ""
-        if not option or len(file.stamps(topic)) < 2:  # a single cloud is a map
-            continue
-        where = f"{file_part(path)}?{option}={topic}"
+    """Add the clouds and ranges that have poses, or why they have none; not clouds made of the depth images."""
+    images = {frame_id_of(file, topic) for topic in depth_topics(file)} - {""}
+    kinds = {"cloud": CLOUDS, "range": (RANGE,)}
+    found = {
+        option: [topic for topic, kind in sorted(file.types.items()) if kind in known and len(file.stamps(topic)) > 1]
+        for option, known in kinds.items()
+    }  # a single cloud is a map
+    wanted = [("cloud", topic) for topic in found["cloud"] if frame_id_of(file, topic) not in images]
+    wanted += [("range", ",".join(found["range"]))] if found["range"] else []
+    for option, topics in wanted:
+        where = f"{file_part(path)}?{option}={topics}"
         try:
-            found = survey(open_source(where))
+            surveyed = survey(open_source(where))
         except StereovoxError as error:
-            lines.append(f"{topic} cannot be mapped: {without_name(error, where)}")
+            lines.append(f"{topics} cannot be mapped: {without_name(error, where)}")
             continue
-        facts.setdefault("clouds", {})[topic] = survey_facts(found)
-        lines += _survey_lines(found)
-        if found.posed:
-            commands += survey_commands(where, found)
+        facts.setdefault("clouds", {})[topics] = survey_facts(surveyed)
+        lines += _survey_lines(surveyed)
+        if surveyed.posed:
+            name = Path(map_name(path)).stem + topics.replace("/", "_").replace(",", "") + ".svox"
+            commands += [command_line("map", where, "--out", name), command_line("picture", name, picture_name(name))]
         else:
-            lines.append(f"give the poses of {topic} with &poses=FILE")
+            lines.append(f"give poses: {command_line('map', f'{where}&poses=FILE', '--out', map_name(path))}")
 
 
 def _bag_maps(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:

@@ -177,7 +177,7 @@ class LiveSphere:
         self.failure = ""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
-        """Accumulate the image of a camera, unless the map refused it; lidar clouds are skipped."""
+        """Accumulate the image of a camera, unless the map refused it; lidar clouds and ranges are skipped."""
         if report.refused or isinstance(frame, Rays):
             return
         try:

@@ -213,7 +213,7 @@ class LiveStream(Stream):
         return epoch_ns() - min(offsets) if offsets else None
 
     def mount(self, frame: AnyFrame) -> Transform:
-        """Return T_body_sensor (4, 4) for the sensor of a frame of this stream; for a cloud, from its own axes."""
+        """Return T_body_sensor (4, 4) for the sensor of a frame of this stream; of rays, from their own axes."""
         mount = self.mounts[frame.sensor]
         return mount @ T_OPTICAL_BODY if isinstance(frame, Rays) else mount
 

@@ -194,7 +194,7 @@ ELSEWHERE = {
     "low_confidence": "camera pair, live: the tracker's confidence is below `min_confidence`",
     "not_localised": "the ROS 2 node does not know where the robot is in its map",
     "clock_doubt": "live, ROS 2: the offset between the clocks of sensors and poses is unknown",
-    "no_camera": "ROS 2: no camera info was received",
+    "no_camera": "ROS 2: no camera info was received; bags and ROS 2: the image is of another camera",
     "tracking_lost": "tracking: the camera's pose is unknown",
     "no_photo": "tracking: a depth image has no color image taken with it",
     "unconfirmed": "first frames of a map that the next one contradicts; they are taken out again",

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Rays, Scan, StereoFrame, name_of
+from stereovox.frame import AnyFrame, AnyImage, Cloud, Frame, Range, Scan, StereoFrame, name_of
 from stereovox.geometry.se3 import apart
 from stereovox.mapping.disagreement import Agreement, DisagreementMonitor, Sight
 from stereovox.mapping.frozen import FrozenViews, is_frozen, jumped, moved_on, with_glance
@@ -43,6 +43,8 @@ RESOLUTION_M, SILENCE, SPREAD = 1e-4, 1 << 40, 3.0
 ROUGH, ROUGH_SHARE = 1e-3, 0.2
 """Measured inverse depth bends by more than this share of itself, at more than this share of the pixels; walls without
 noise do not, and look the same from many places."""
+Seen = Frame | StereoFrame | Cloud | Scan
+"""Frames and scans that repeat if their sensor is frozen: all but ranges."""
 
 
 class GateResult(NamedTuple):
@@ -172,7 +174,7 @@ class Gate:
         usual = "range" if isinstance(frame, Range) else usual
         return frame.sensor or usual, int(frame.stamp_ns)
 
-    def _look(self, frame: AnyFrame | Scan, sensor: str, now: StampedPose) -> ImageFingerprint | None:
+    def _look(self, frame: Seen, sensor: str, now: StampedPose) -> ImageFingerprint | None:
         """Return the frame's checksum. Raises FrameRefused if the image repeats although the sensor has moved."""
         if not self._trust.frozen:
             return None
@@ -201,7 +203,7 @@ class Gate:
                 return passed._replace(look=before, is_cone=True, repeats=True)
         return passed._replace(look=look, is_cone=True)
 
-    def _glances(self, frame: AnyFrame | Scan, passed: GateResult, image: AnyImage) -> tuple[Glance, ...]:
+    def _glances(self, frame: Seen, passed: GateResult, image: AnyImage) -> tuple[Glance, ...]:
         """Return the glances to keep. Raises FrameRefused for a frame that repeats a view from elsewhere."""
         glances, before = self._history.glances.get(passed.sensor, ()), self._history.trusted.get(passed.sensor)
         anew = not glances or before is None or jumped(glances, before, passed.seen)
@@ -289,14 +291,12 @@ def _rows(image: np.ndarray) -> np.ndarray:
     return image[DIGEST_ROWS // 2 if len(image) > DIGEST_ROWS else 0 :: max(1, len(image) // DIGEST_ROWS)]
 
 
-def _digest(frame: AnyFrame | Scan) -> int:
+def _digest(frame: Seen) -> int:
     """Return a checksum of DIGEST_ROWS rows of the frame's images, of DIGEST_POINTS points, or of all ranges."""
     if isinstance(frame, StereoFrame):
         parts = _rows(frame.left), _rows(frame.right)
     elif isinstance(frame, Cloud):
         parts = (frame.points[:: max(1, len(frame.points) // DIGEST_POINTS)],)
-    elif isinstance(frame, Range):
-        parts = (np.array([frame.distance]),)
     else:
         parts = (frame.ranges if isinstance(frame, Scan) else _rows(frame.depth),)
     number = 0
@@ -305,13 +305,13 @@ def _digest(frame: AnyFrame | Scan) -> int:
     return number
 
 
-def _is_measured(frame: AnyFrame | Scan) -> bool:
+def _is_measured(frame: Seen) -> bool:
     """Return whether depths or ranges have noise: whether their inverse bends between neighbours.
 
     The inverse depth of a plane does not bend in an image, nor, corrected for the angle step, between beams. Stereo
     frames and clouds always count as measured.
     """
-    if isinstance(frame, StereoFrame | Rays):
+    if isinstance(frame, StereoFrame | Cloud):
         return True
     is_scan = isinstance(frame, Scan)
     rows = (frame.ranges[None] if is_scan else _rows(frame.depth)).astype(float)

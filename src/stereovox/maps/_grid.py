@@ -105,7 +105,7 @@ def see(table, coords, cells, unknown, limits, indices, around, out):
 def share_until(table, coords, cells, unknown, least, x, y, to_x, to_y):
     """Return how far (0 to 1) a line runs until a known cell holds `least` or more; infinity if there is none.
 
-    It is looked at every STEP cells at most, so corners that it cuts do not count.
+    It is sampled every STEP cells at most, so corners that it cuts do not count.
     """
     steps = int(max(abs(to_x - x), abs(to_y - y)) / STEP) + 1
     at_x, at_y, tile = np.int64(1) << 40, np.int64(1) << 40, np.int64(-1)

@@ -117,7 +117,7 @@ class GridStorage(Guarded):
         return found
 
     def cast(self, lines: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (0 to 1) lines (N, 4), x, y to x, y in cells, run to an occupied cell; inf where none is."""
+        """Return how far (0 to 1) lines (N, 4), x, y to x, y in cells, run to an occupied cell; inf without one."""
         pool, found, unknown = self._pool, np.empty(len(lines)), np.int32(self.cell_format.unknown)
         _grid.cast(pool.table, pool.coords, pool.values, unknown, self.rules.thresholds.occupied_least, lines, found)
         return found

@@ -19,8 +19,8 @@ UP, DOWN, CUSTOM = 24, 25, 100
 """Further orientations; the others are refused."""
 UNKNOWN_VARIANCE, INVALID = 255, 1
 """`covariance` in cm^2 if it is not known, and the `signal_quality` of no reading."""
-USUAL_BEAM, USUAL_SIGMA_M = radians(30), 0.03
-"""Of sensors that report neither."""
+USUAL = RangeSensor()
+"""Of sensors that report neither noise nor beam."""
 
 
 def range_of(message: Any, T_world_body: Transform, stamp_ns: int, silence_clears: bool = False) -> Range:
@@ -44,13 +44,13 @@ def range_of(message: Any, T_world_body: Transform, stamp_ns: int, silence_clear
         0.01 * number for number in (message.min_distance, message.max_distance, message.current_distance)
     )
     variance = float(message.covariance)
-    sigma = USUAL_SIGMA_M if variance == UNKNOWN_VARIANCE or variance <= 0 else 0.01 * sqrt(variance)
+    sigma = USUAL.sigma if variance == UNKNOWN_VARIANCE or variance <= 0 else 0.01 * sqrt(variance)
     width = max(float(getattr(message, "horizontal_fov", 0)), float(getattr(message, "vertical_fov", 0)))
     if not 0 <= least < most:
         raise FrameRefused(
             "bad_form", f"DISTANCE_SENSOR {message.id}: limits {least:g} to {most:g} m; check its driver"
         )
-    beam = RangeSensor(sigma, least, most, width if width > 0 else USUAL_BEAM, silence_clears)
+    beam = RangeSensor(sigma, least, most, width if width > 0 else USUAL.beam, silence_clears)
     distance = inf if now > most else -inf if now < least else now
     if getattr(message, "signal_quality", 0) == INVALID:
         distance = nan

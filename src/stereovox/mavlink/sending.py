@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import StereovoxError
-from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Rays, UpdateReport
+from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Range, Rays, UpdateReport
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.mapper import Mapper
 from stereovox.mavlink.body import Body, BodyPose
@@ -57,7 +57,7 @@ class ObstacleSender:
         directions: Rules of OBSTACLE_DISTANCE_3D; None: it is not sent.
         mounts: T_body_sensor (4, 4) by the name of the sensor: maps a camera's optical frame into the body in optical
             axes (x right, y down, z forward); for a lidar its own frame (x forward, y left, z up). One that is not
-            named faces ahead at the body's origin.
+            named faces ahead at the body's origin; a range sensor that is not named gives no pose.
         tell: Called with one line when sending stops, with the reason, and when it resumes.
 
     Attributes:
@@ -108,6 +108,8 @@ class ObstacleSender:
         """
         if report.refused is not None:
             return
+        if isinstance(frame, Range) and frame.sensor not in self._mounts:
+            return  # a sonar may look anywhere
         mount = self._mounts.get(frame.sensor, T_BODY_LIDAR if isinstance(frame, Rays) else None)
         T_world_sensor = orthonormalise(np.asarray(frame.T_world_sensor, float))
         T_world_body = T_world_sensor if mount is None else T_world_sensor @ inverse(mount)

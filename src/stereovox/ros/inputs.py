@@ -17,7 +17,7 @@ from stereovox.cameras.lidar import Lidar
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Cloud, Frame, Range, Scan
+from stereovox.frame import Cloud, Frame, Range, Rays, Scan
 from stereovox.geometry.se3 import inverse
 from stereovox.ros.poses.poses import Pose, PoseBuffer
 from stereovox.sources.bags.compressed_depth import SUFFIXES, plain_topic
@@ -57,7 +57,7 @@ class Input(Protocol):
         """Return whether no later message can change the pose of a message."""
         return poses.is_final(frame_id, stamp_ns)
 
-    def frame(self, data: bytes, where: PoseLookup) -> Frame | Cloud | Range | Scan | None:
+    def frame(self, data: bytes, where: PoseLookup) -> Frame | Rays | Scan | None:
         """Convert a message; the `fault` of the result says why it cannot be used. None: do not map it."""
         ...
 
@@ -178,18 +178,18 @@ class RaysInput(Input):
 
 
 class RangeInput(Input):
-    """Distances of a sonar or radar, for 3-D and floor maps. silence_clears: as in `RangeSensor`."""
+    """Distances of a sonar or radar, for 3-D and floor maps. sigma, silence_clears: as for `range_of_reading`."""
 
     kind = "sensor_msgs/Range"
 
-    def __init__(self, topic: str, silence_clears: bool = False):
-        self.topic, self._silence_clears = topic, silence_clears
+    def __init__(self, topic: str, sigma: float = 0.0, silence_clears: bool = False):
+        self.topic, self._sigma, self._silence_clears = topic, sigma, silence_clears
 
     def frame(self, data: bytes, where: PoseLookup) -> Range | Cloud:
         """Convert a distance."""
         try:
             reading = read_range(Wire(data, cdr=True))
-            found = range_of_reading(reading, silence_clears=self._silence_clears)
+            found = range_of_reading(reading, self._sigma, self._silence_clears)
             return _at(found, self.topic, where, frame_name(reading.frame_id))
         except (FrameRefused, StereovoxError, ValueError) as error:
             return _no_cloud(self.topic, error)

@@ -11,7 +11,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.formats.map_server import read_map_server
-from stereovox.frame import Cloud, Frame, Range, Scan, UpdateReport
+from stereovox.frame import Frame, Rays, Scan, UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
@@ -69,7 +69,7 @@ class Mapping:
         """Set the clock of the frames' stamps, as `Mapper.stamp_clock`, for this mapper and later ones."""
         self._stamp_clock = self.mapper.stamp_clock = clock
 
-    def add(self, frame: Frame | Cloud | Range | Scan) -> UpdateReport:
+    def add(self, frame: Frame | Rays | Scan) -> UpdateReport:
         """Add a frame or scan to the map."""
         return self.mapper.add(frame)
 
@@ -87,7 +87,7 @@ class Mapping:
         return self.mapper.health()
 
     def grid(self, last: bool = False) -> OccupancyGrid | None:
-        """Return the 2-D map; None if nothing is known. last: of a run, as `LiveProjection.grid`."""
+        """Return the 2-D map; None if nothing is known. last: it is the final one (`LiveProjection.grid`)."""
         return self._above(last=last)
 
     def snapshot(self) -> Callable[[], VoxelMap] | None:

@@ -15,7 +15,7 @@ from time import monotonic_ns
 from typing import Any, NamedTuple
 
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Cloud, Frame, Range, UpdateReport
+from stereovox.frame import Frame, Rays, UpdateReport
 from stereovox.geometry.se3 import inverse
 from stereovox.mapping.rebuild import CorrectionReport
 from stereovox.ros.inputs import PoseLookup, header
@@ -189,7 +189,7 @@ class MapNode:
             frame = replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
         report = self._mapping.add(frame)
         self._on_report(report)
-        if self._corrector is not None and isinstance(frame, Frame | Cloud | Range) and not frame.fault:
+        if self._corrector is not None and isinstance(frame, Frame | Rays) and not frame.fault:
             self._corrector.seen(sensor, one.frame_id, frame, not report.refused)
         if report.refused:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)

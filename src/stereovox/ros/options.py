@@ -37,7 +37,8 @@ class Options:
     """Options of the command, and parameters of the node with the prefix `ros.`.
 
     depth: topics of depth images; `TOPIC=INFO` if the camera_info is not next to it. cloud, scan, range: topics;
-    silence_clears: whether the cone of a range in which nothing was heard is free.
+    silence_clears: whether the cone of a range in which nothing was heard is free. range_sigma: standard deviation of
+    ranges in metres (0: the message's, else 0.03).
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
     poses: `given`, from tf and the topics above; `track`, from the first depth camera by visual odometry; `slam`, by
@@ -69,6 +70,7 @@ class Options:
     scan: tuple[str, ...] = ()
     range: tuple[str, ...] = ()
     silence_clears: bool = False
+    range_sigma: float = 0.0
     odometry: tuple[str, ...] = ()
     pose: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
@@ -125,6 +127,8 @@ class Options:
         if not 1 <= self.queue <= 1000:
             raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
         self.ranges.lidar  # noqa: B018 - its numbers are checked
+        if not 0 <= self.range_sigma < math.inf:
+            raise StereovoxError(f"{PREFIX}range_sigma {self.range_sigma:g}: give metres, or 0 for the message's own")
         if lacking := [text for text in self.pose if not all(split_pair(text))]:
             raise StereovoxError(f"{PREFIX}pose '{lacking[0]}': write TOPIC=FRAME, the frame whose pose it is")
         if math.isnan(self.low) != math.isnan(self.high) or self.low >= self.high:
@@ -153,7 +157,9 @@ class Options:
     def check_sources(self) -> Options:
         """Return these options; raises StereovoxError without an input topic, or if options exclude each other."""
         if not (self.depth or self.cloud or self.scan or self.range or (self.localised and self.lidar)):
-            raise StereovoxError("no topic to map; give --depth /camera/image_rect_raw, --cloud, --scan or --range")
+            raise StereovoxError(
+                "no topic to map; give --depth /camera/depth/image_rect_raw, --cloud, --scan or --range"
+            )
         if self.poses == TRACK and not self.depth:
             raise StereovoxError("--poses track: it needs a depth camera; give --depth, or poses by --poses given")
         if self.poses == TRACK and (self.odometry or self.pose):

@@ -83,7 +83,7 @@ class NodeRun(Run[None, dict[str, Any]]):
         reserve(topics.out, config.dimensions, stack)
         if topics.slam_out:
             reserve(topics.slam_out, 2, stack)
-        warm_up(config, topics.poses == TRACK, topics.localised, bool(topics.cloud or topics.scan))
+        warm_up(config, topics.poses == TRACK, topics.localised, bool(topics.cloud or topics.scan or topics.range))
         tiles = Path(topics.out).parent / f".{Path(topics.out).name}-tiles" if topics.out else None
         self._mapping = Mapping(config, topics.heights, tiles, self._node.get_logger().warning)
         stack.callback(self._mapping.close)

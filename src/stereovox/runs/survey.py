@@ -91,7 +91,7 @@ class Survey:
 
     Attributes:
         name: Name of the recording.
-        kind: `depth`, `stereo` or `cloud`.
+        kind: `depth`, `stereo`, `cloud` or `range`.
         frames: Number of frames.
         seconds: Time from the first to the last frame; 0 if the recording has no times.
         camera: Camera of all frames.
@@ -209,6 +209,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     numbers = np.unique(np.linspace(0, len(source) - 1, min(frames, len(source))).astype(int)).tolist()
     read = [source.frame(i) for i in numbers]
     posed = [frame for frame in read if _has_pose(frame)]
+    held: list[AnyFrame] = [frame for frame in posed if not isinstance(frame, Range)]  # a sonar may look anywhere
     images = [frame for frame in read if isinstance(frame, Frame) and frame.depth.size]
     depths = [_depth_m(frame) for frame in images] + [_ranges(frame) for frame in read if isinstance(frame, Rays)]
     valid = np.concatenate([np.empty(0), *(depth[np.isfinite(depth)] for depth in depths)])
@@ -218,7 +219,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
     unit = source.unit
     return Survey(
         name=source.name,
-        kind=KINDS[type(read[0])],
+        kind=KINDS[type(next((frame for frame in read if not frame.fault), read[0]))],
         frames=len(source),
         seconds=(read[-1].stamp_ns - read[0].stamp_ns) / 1e9,
         camera=source.camera,
@@ -233,7 +234,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
         unit_m=None if unit is None else unit.scale,
         unit_sure=unit is not None and unit.sure,
         unit_why="" if unit is None else unit.why,
-        up=find_up(source, posed) if posed else None,
+        up=find_up(source, held) if held else None,
         max_range=max_range,
         voxel_size=suggest_cell(valid, max_range.value),
         notes=tuple(source.notes),
@@ -373,7 +374,7 @@ def _has_pose(frame: AnyFrame) -> bool:
 
 def _own_up(frame: AnyFrame) -> NDArray[np.float64]:
     """Return the direction (3,) in the world that is up if the sensor is upright; lidars have other axes."""
-    return frame.T_world_sensor[:3, 2] if isinstance(frame, Rays) else -frame.T_world_sensor[:3, 1]
+    return frame.T_world_sensor[:3, 2] if isinstance(frame, Cloud) else -frame.T_world_sensor[:3, 1]
 
 
 def _ranges(cloud: Rays) -> NDArray[np.float64]:

@@ -103,7 +103,7 @@ def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:
     figure.text(0.02, 1 - 0.76 / figure.get_figheight(), "   ·   ".join(facts), fontsize=12.5, color=GREY)
 
 
-def checked(path: str | Path, dpi: float | None = None) -> str:
+def checked_ending(path: str | Path, dpi: float | None = None) -> str:
     """Return the suffix of a picture's file; raises StereovoxError as `save`, before anything is drawn."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
@@ -121,7 +121,7 @@ def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
     """
     from matplotlib import rc_context
 
-    ending = checked(path, dpi)
+    ending = checked_ending(path, dpi)
     undated = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[ending]
     with replacing(path, StereovoxError) as file, rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):
         figure.savefig(file, dpi=dpi or figure.dpi, format=ending[1:], metadata=undated)

@@ -29,7 +29,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="explore until no frontier can be reached, find the middle of the room and look around, or visit "
         "--waypoints and return (%(default)s)",
     )
-    parser.add_argument("--waypoints", metavar="X,Y;...", default="", help="places to visit, in metres, in order")
+    parser.add_argument(
+        "--waypoints", metavar="X,Y;...", default="", help="places to visit, metres (--waypoints=-2,3;2,1)"
+    )
     parser.add_argument("--seeds", default="0:5", metavar="A:B", help="starts, each flown in each scene (%(default)s)")
     parser.add_argument("--seconds", type=float, default=300.0, metavar="S", help="longest flight (%(default)s)")
     parser.add_argument("--speed", type=float, default=0.6, metavar="M/S", help="along paths, m/s (%(default)s)")

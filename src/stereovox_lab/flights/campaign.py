@@ -82,7 +82,7 @@ def explore(
     _check(scenes, mission, numbers, cruise, jobs)
     places = tuple((float(x), float(y)) for x, y in waypoints)
     if bool(places) != (mission == WAYPOINTS):
-        raise StereovoxError("way-points and the mission `waypoints` need each other; give both")
+        raise StereovoxError("waypoints and the mission `waypoints` need each other; give both")
     folder = None if maps is None else Path(maps)
     flights = [
         _Flight(_narrow(scene), seed, mission, places, cruise, _map_of(folder, i) if seed == numbers[0] else None)
@@ -112,10 +112,11 @@ def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the summary of all flights in one scene; medians are over flights.
 
     `seconds_to_share`: median seconds until a flight knew that share of the air, None if fewer than half reached it.
-    `left`: remaining frontiers of all flights together, by the reason they were not visited.
+    `left`: goals left in all flights together, by the reason they were not visited. `reached`, `home`: number of
+    waypoints reached, and of flights that returned; None for other missions.
     """
     mine = [row for row in rows if row["scene"] == scene]
-    last = [row["coverage"][-1][1] for row in mine]
+    last, tours = [row["coverage"][-1][1] for row in mine], mine[0].get("reached") is not None
     return {
         "scene": scene,
         "flights": len(mine),
@@ -124,6 +125,8 @@ def summary(scene: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "seconds_median": _median(row["seconds"] for row in mine),
         "metres": round(sum(row["metres"] for row in mine), 1),
         "goals": sum(row["goals"] for row in mine),
+        "reached": sum(row["reached"] for row in mine) if tours else None,
+        "home": sum(row["home"] for row in mine) if tours else None,
         "left": dict(sum((Counter(row["left"]) for row in mine), Counter())),
         "clearance_least_m": round(min(row["clearance_m"] for row in mine), 3),
         "coverage_median": _median(last),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.level_ways import LevelPlanner
+from stereovox.products.floor.level_ways import LevelPlanner, Waypoints
 from stereovox.products.frontiers import Frontier, frontiers
 from stereovox.products.path_check import check_path, point_along
 from stereovox_lab.flights.air import Air
@@ -90,7 +90,9 @@ class Mission(Protocol):
 
     left: dict[str, int]
 
-    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(
+        self, voxel_map: VoxelMap, planner: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return a path (N, 3) and the place (3,) to look at from its end, NaN to look all around; None when done."""
         ...
 
@@ -103,13 +105,15 @@ class MiddleOfRoom:
         self.room_m = 0.0
         self.left: dict[str, int] = {}
 
-    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(
+        self, voxel_map: VoxelMap, planner: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the path to the middle as currently known."""
-        found = ways.middle()
+        found = planner.middle()
         if found is None or not self._looks_left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
             return None
         (self._last, self.room_m), self._looks_left = found, self._looks_left - 1
-        way = ways.path_to(self._last)
+        way = planner.path_to(self._last)
         return None if way is None else (way, np.full(3, np.nan))
 
 
@@ -124,27 +128,29 @@ class Frontiers:
         self._in_vain = 0
         self.left: dict[str, int] = {}
 
-    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(
+        self, voxel_map: VoxelMap, planner: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the path to the nearest frontier's viewpoint, or to a place to look all around."""
-        self._rounds = self._rounds or [ways.start]  # it turned once at the start
-        height = ways.start[2]
+        self._rounds = self._rounds or [planner.start]  # it turned once at the start
+        height = planner.start[2]
         found = frontiers(
             voxel_map,
             self._smallest,
             heights=(0.0, 2 * self._band),
             floor=height - self._band,
-            start=ways.start,
+            start=planner.start,
             radius=0.2,
         )
         if self._looks:  # the last was seen only if it reached the end of the path
             place, end, _ = self._looks[-1]
-            self._looks[-1] = place, end, bool(np.linalg.norm((ways.start - end)[:2]) < 2 * ARRIVED)
-        best = self._nearest(found, ways, NEAR_M) or self._nearest(found, ways, SHORT_M)
+            self._looks[-1] = place, end, bool(np.linalg.norm((planner.start - end)[:2]) < 2 * ARRIVED)
+        best = self._nearest(found, planner, NEAR_M) or self._nearest(found, planner, SHORT_M)
         self._in_vain = 0 if best is not None else self._in_vain + 1
         if best is None and self._in_vain <= ROUNDS:
-            best = self._round(found, ways)
+            best = self._round(found, planner)
         if best is None:
-            self.left = self._why_left(found, ways)
+            self.left = self._why_left(found, planner)
         else:
             self._looks.append((best[1], best[0][-1], False))
         return best
@@ -159,12 +165,12 @@ class Frontiers:
         return any(same) or len(same) >= TRIES
 
     def _nearest(
-        self, found: list[Frontier], ways: LevelPlanner, near: float
+        self, found: list[Frontier], planner: LevelPlanner, near: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the shortest path to within `near` metres of a frontier's viewpoint, and the frontier's middle."""
         best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         for one in found:
-            way = None if one.look_from is None else ways.path_to(one.look_from, near)
+            way = None if one.look_from is None else planner.path_to(one.look_from, near)
             if way is None or self._is_done(one.centroid, way[-1]):
                 continue
             if best is None or _length(way) < _length(best[0]):
@@ -172,20 +178,24 @@ class Frontiers:
         return best
 
     def _round(
-        self, found: list[Frontier], ways: LevelPlanner
+        self, found: list[Frontier], planner: LevelPlanner
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the path to a look around from as near as possible to a frontier, the largest first."""
         for one in found:
-            way = ways.path_to(one.centroid, inf)
+            way = planner.path_to(one.centroid, inf)
             if way is not None and all(np.linalg.norm((way[-1] - place)[:2]) > ROUND_M for place in self._rounds):
                 self._rounds.append(way[-1])
                 return way, np.full(3, np.nan)
         return None
 
-    def _why_left(self, found: list[Frontier], ways: LevelPlanner) -> dict[str, int]:
+    def _why_left(self, found: list[Frontier], planner: LevelPlanner) -> dict[str, int]:
         """Count the remaining frontiers, by the reason they are not goals."""
         why = [
-            UNSEEN if one.look_from is None else NO_WAY if ways.path_to(one.look_from, SHORT_M) is None else LOOKED_AT
+            UNSEEN
+            if one.look_from is None
+            else NO_WAY
+            if planner.path_to(one.look_from, SHORT_M) is None
+            else LOOKED_AT
             for one in found
         ]
         return {reason: why.count(reason) for reason in (UNSEEN, NO_WAY, LOOKED_AT)}
@@ -208,7 +218,8 @@ class Explored:
         path: (3,) metres every second.
         room_m: Horizontal clearance at its last position in metres, `half_height` above and below.
         most_room_m: The largest such clearance in the scene's air at its height.
-        left: Number of remaining frontiers, by reason; empty if the mission did not end by itself.
+        left: Number of goals left (frontiers, or waypoints and home), by reason; empty if it did not end by itself.
+        reached: Number of waypoints reached, and home: whether it returned; None for other missions.
     """
 
     seed: int
@@ -224,6 +235,8 @@ class Explored:
     room_m: float
     most_room_m: float
     left: dict[str, int]
+    reached: int | None = None
+    home: bool | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return all values as plain types for JSON."""
@@ -298,7 +311,9 @@ class _Mission:
         place = self._quad.position
         room_m, most_m = self._air.room(place, self._cruise.half_height)
         course = (metres, self._goals, least, coverage, place.tolist(), path, room_m, most_m, self._mission.left)
-        return Explored(self._seed, collided, now, done, *course)
+        tour = self._mission if isinstance(self._mission, Waypoints) else None
+        reached, home = (None, None) if tour is None else (sum(tour.reached), tour.is_home)
+        return Explored(self._seed, collided, now, done, *course, reached, home)
 
     def _see(self, now: float) -> None:
         """Take an image if one is due, and add images to the map whose delay has passed."""
@@ -314,8 +329,8 @@ class _Mission:
         """Choose the next path; return whether there is one."""
         cruise = self._cruise
         here = np.array([*self._quad.position[:2], self._height])
-        ways = LevelPlanner(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
-        found = self._mission.next(self._mapper.map, ways)
+        planner = LevelPlanner(self._mapper.map, here, cruise.radius, cruise.half_height, cruise.own_radius)
+        found = self._mission.next(self._mapper.map, planner)
         if found is None:
             return False
         (self._way, self._look_at), self._goals = found, self._goals + 1

@@ -12,20 +12,22 @@ from stereovox.view.coverage import coverage_png
 from stereovox.view.report import page
 
 HEADS = ("scene", "flights", "collisions", "ended by itself", "metres", "goals", "least clearance, m",
-         "air known: median", "air known: least", "50 % known after, s", "80 % known after, s", "frontiers left",
+         "air known: median", "air known: least", "50 % known after, s", "80 % known after, s", "goals left",
          "room at the end, m", "most room there is, m")  # fmt: skip
 FLIGHT_HEADS = ("scene", "seed", "collided, s", "seconds", "ended by itself", "metres", "goals", "clearance, m",
-                "air known", "frontiers left", "room, m")  # fmt: skip
+                "air known", "goals left", "room, m")  # fmt: skip
 MISSIONS = {
     "frontiers": "Go to the frontier nearest along the path and look at it; if none can be reached, look all round.",
     "middle": "Find the middle of the room as it is known, look round there, until it stays where it is.",
+    "waypoints": "Visit the places in order, through known free space, and return.",
 }
 WHAT = (
     "A collision: a surface of the scene is nearer to the vehicle's middle than its radius. Clearance: the least "
     "distance from its middle to a surface. Air: the cells of the scene that touch nothing, have something above and "
     "below them, and are connected with the start; known: the map calls them free. Ended by itself: no goal was left; "
-    "else time was up, or it collided. Frontiers left: known air next to unknown where it ended by itself, and why it "
-    "did not go there; if there is no way, a smaller margin or smaller cells may find one. Room: horizontal "
+    "else time was up, or it collided. Goals left: frontiers (known air next to unknown) "
+    "or waypoints if it ended by itself, and why it did not go there; if there is no path, a smaller margin or smaller "
+    "cells may find one. Room: horizontal "
     "distance to the nearest surface in the vehicle's heights."
 )
 

@@ -412,6 +412,36 @@ def test_ranges_of_several_sonars_in_a_bag(tmp_path, name):
     assert free.frame(0).beam.sigma == 0.1
 
 
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ("range=/left,/right&mount=0.1,0,0", "have their mounts in /tf"),
+        ("range=/left&range_max=2", "range_max= is not for"),
+        ("range=/left&deskew=0", "deskew= is not for"),
+    ],
+)
+def test_options_that_ranges_do_not_use_are_refused(tmp_path, options, why):
+    bag = write_sonars(tmp_path / "sonars.bag", [1.0, 1.0])
+    with pytest.raises(SourceError, match=why):
+        sv.open_source(f"{bag}?{options}")
+
+
+def test_a_second_topic_in_the_worlds_own_frame_is_refused(tmp_path):
+    """Its rays would begin at the world's origin, and clear what nobody saw."""
+    with RobotBagMaker(tmp_path / "two.bag") as bag:
+        for k in range(40):
+            stamp = START_NS + (10 * k - 100) * MS
+            bag.tf(stamp, "odom", "lidar", planar_numbers(0.01 * k, 0, 0))
+        for topic, frame in (("/points", "lidar"), ("/map", "odom")):
+            for n in range(2):
+                stamp = START_NS + 100 * n * MS
+                bag.add(topic, "sensor_msgs/PointCloud2", stamp, bag.cloud(stamp, POINTS[:2] + n, frame))
+    path = tmp_path / "two.bag"
+    assert len(list(sv.open_source(f"{path}?cloud=/points"))) == 2
+    with pytest.raises(SourceError, match="/map is in frame 'odom', in which lidar moves"):
+        sv.open_source(f"{path}?cloud=/points,/map")
+
+
 def test_a_bag_of_ranges_becomes_a_map_by_the_command(tmp_path, capsys):
     bag = write_sonars(tmp_path / "sonars.bag", [1.0, 1.0, 1.0, 1.01, 1.02, 1.0])
     assert main(["map", f"{bag}?range=/left", "--out", str(tmp_path / "m.svox"), "--voxel-size", "0.1"]) == 0
@@ -429,6 +459,8 @@ def test_a_bag_of_ranges_becomes_a_map_by_the_command(tmp_path, capsys):
         ("cloud=/scan", "holds sensor_msgs/LaserScan"),
         ("cloud=/points&scan=/scan", "give one of"),
         ("cloud=/points,/scan", "holds sensor_msgs/LaserScan"),
+        ("cloud=/points,/points", "several topics must differ"),
+        ("cloud=/points&silence_clears=1", "silence_clears= is not for"),
         ("cloud=/points&depth=/d", "unknown parameter 'depth'"),
         ("cloud=/points&sigma=0.0001&range_min=-3", "range"),
     ],

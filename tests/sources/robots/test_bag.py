@@ -542,7 +542,7 @@ def test_the_wall_behind_a_door_is_no_mark(tmp_path):
 
 
 @ENDINGS
-def test_an_image_of_another_camera_on_the_topic_has_no_pose(tmp_path, ending):
+def test_an_image_of_another_camera_on_the_topic_is_refused(tmp_path, ending):
     def images(bag: RobotBagMaker) -> None:
         for k, frame_id in enumerate(("optical", "rear", "optical")):
             stamp = START_NS + k * 100 * MS
@@ -552,5 +552,5 @@ def test_an_image_of_another_camera_on_the_topic_has_no_pose(tmp_path, ending):
 
     path = made(tmp_path / f"a{ending}", mounts, drive, images)
     for frames in (RobotBag(path).frames, list(open_source(path))):
-        assert [frame.fault for frame in frames] == [None, "no_pose", None]
+        assert [frame.fault for frame in frames] == [None, "no_camera", None]
         assert "it is in frame 'rear', the camera of its topic in 'optical'" in frames[1].fault_detail

@@ -19,7 +19,7 @@ from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.robots.bag import RobotBag
 
 ENDINGS = pytest.mark.parametrize("ending", [".bag", ".db3"])
-FAULTS = {None, "unreadable", "no_pose", "bad_dtype", "bad_shape"}
+FAULTS = {None, "unreadable", "no_pose", "no_camera", "bad_dtype", "bad_shape"}
 ENOUGH = 30_000_000
 
 

@@ -56,12 +56,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.view.figures import checked, save
+    from stereovox.view.figures import checked_ending, save
     from stereovox.view.scene.dark import darken
 
     arguments.file = arguments.file or _usual_file(arguments.map)
     file = Path(arguments.file)
-    checked(file, arguments.dpi)
+    checked_ending(file, arguments.dpi)
     heading = _plain(arguments.title or Path(arguments.map).stem)
     drawn = DRAW[dimensions(arguments.map)](arguments, heading)
     if arguments.dark:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths of a vehicle at one height through known free space, the middle of that space, and a tour of way-points."""
+"""Paths of a vehicle at one height through known free space, the middle of that space, and a tour of waypoints."""
 
 from __future__ import annotations
 
 from collections import Counter
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,13 +20,18 @@ CLEAR = 0.3
 """A step costs its length times 1 + this (metres) over the clearance: paths keep to the middle."""
 SIDES = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Steps to neighbours; each also counts in reverse."""
-NEARER_M, SAME_M, TRIES = 0.3, 0.6, 3
-"""A path towards a way-point ends nearer to it than all before by this much, or leads to a frontier that is this far
-from all that were looked at. A way-point to which this many known paths had to be abandoned is given up."""
+NEARER_M, SAME_M, TRIES, NEAR_M = 0.3, 0.6, 3, (0.5, 2.0)
+"""A path towards a waypoint ends nearer to it than all before by NEARER_M, or leads to within NEAR_M of the viewpoint
+of a frontier that is SAME_M from all that were looked at. A waypoint, or a frontier, to which TRIES known paths had to
+be abandoned is given up."""
 FRONTIER_CELLS, BAND = 15, 0.6
 """Fewest cells of a frontier on the way, and metres above and below the vehicle in which it is sought."""
 NO_PATH, ABANDONED = "no path to it", "paths to it abandoned"
-"""Reasons why a way-point was given up."""
+"""Reasons why a waypoint was given up."""
+
+
+Leg = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""A path (N, 3) in metres, and the place (3,) to look at from its end."""
 
 
 class LevelPlanner:
@@ -143,7 +149,8 @@ class Waypoints:
     """A tour of places, and the path home, through space that is known to be free.
 
     The loop that flies or drives calls `next` once the vehicle has stopped: at the end of a path, or where it had to be
-    abandoned. A place that no known path reaches is approached, and explored for, until nothing is left to look at.
+    abandoned. If no known path reaches a place, the vehicle approaches it and explores, until no frontier is left to
+    look at.
 
     Args:
         places: (N, 2) or (N, 3) metres in the map's frame, in order; heights are ignored.
@@ -163,35 +170,40 @@ class Waypoints:
         try:
             goals = np.asarray(places, float)
         except (TypeError, ValueError):
-            raise StereovoxError(f"way-points {shown(places)}: give (N, 2) or (N, 3) metres") from None
+            raise StereovoxError(f"waypoints {shown(places)}: give (N, 2) or (N, 3) metres") from None
         if goals.ndim != 2 or goals.shape[1] not in (2, 3) or not np.isfinite(goals).all():
-            raise StereovoxError(f"way-points of shape {goals.shape}: give (N, 2) or (N, 3) finite metres")
+            raise StereovoxError(f"waypoints of shape {goals.shape}: give (N, 2) or (N, 3) finite metres")
         if not 0 < near < np.inf:
             raise StereovoxError(f"near {near}: give metres above 0")
         self.reached, self.is_home, self.left = [False] * len(goals), False, dict[str, int]()
         self._goals, self._near, self._returns, self._began = list(goals[:, :2]), near, home, False
         self._current, self._tries, self._best = 0, 0, np.inf
-        self._looked: list[NDArray[np.float64]] = []
+        self._looks: list[_Look] = []
 
-    def next(self, voxel_map: VoxelMap, ways: LevelPlanner) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(
+        self, voxel_map: VoxelMap, planner: LevelPlanner
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return the next path.
 
         Args:
             voxel_map: The map, as it is now.
-            ways: A planner on it, whose start is the vehicle's position.
+            planner: A planner on it, whose start is the vehicle's position.
 
         Returns:
-            The path (N, 3) in metres, and the place (3,) to look at from its end, NaN to look all around; None once the
-            tour is done.
+            The path (N, 3) in metres, and the place (3,) to look at from its end; None once the tour is done.
+
+        Raises:
+            StereovoxError: As `frontiers`.
         """
+        self._look(planner.start)
         if not self._began:
             self._began = True
-            self._goals += [ways.start[:2].copy()] * self._returns
+            self._goals += [planner.start[:2].copy()] * self._returns
         while self._current < len(self._goals):
             goal = self._goals[self._current]
-            if np.linalg.norm(ways.start[:2] - goal) <= self._near:
+            if np.linalg.norm(planner.start[:2] - goal) <= self._near:
                 self._arrive()
-            elif (found := self._towards(goal, voxel_map, ways)) is not None:
+            elif (found := self._towards(goal, voxel_map, planner)) is not None:
                 return found
             else:
                 reason = ABANDONED if self._tries >= TRIES else NO_PATH
@@ -207,43 +219,61 @@ class Waypoints:
         self._go_on()
 
     def _go_on(self) -> None:
-        self._current, self._tries, self._best, self._looked = self._current + 1, 0, np.inf, []
+        self._current, self._tries, self._best, self._looks = self._current + 1, 0, np.inf, []
 
-    def _towards(
-        self, goal: NDArray[np.float64], voxel_map: VoxelMap, ways: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the path to a place, or one after which more is known of the way there; None to give it up."""
-        target = np.array([*goal, ways.start[2]])
-        if (path := ways.path_to(target, self._near)) is not None:
+    def _towards(self, goal: NDArray[np.float64], voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
+        """Return the path to a place, or one that reveals more of the route; None: give it up."""
+        target = np.array([*goal, planner.start[2]])
+        if (path := planner.path_to(target, self._near)) is not None:
             self._tries += 1
             return (path, target) if self._tries <= TRIES else None
-        path = ways.path_to(target, np.inf)
+        path = planner.path_to(target, np.inf)
         if path is not None and (away := float(np.linalg.norm(path[-1][:2] - goal))) < self._best - NEARER_M:
             self._best = away
             return path, target
-        return self._explore(target, voxel_map, ways)
+        return self._explore(target, voxel_map, planner)
 
-    def _explore(
-        self, target: NDArray[np.float64], voxel_map: VoxelMap, ways: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return the path to the frontier by which the way to a place is shortest, of those not looked at."""
-        height = ways.start[2]
+    def _explore(self, target: NDArray[np.float64], voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
+        """Return the path to the frontier with the shortest route to a place, of those not looked at."""
+        height = planner.start[2]
         found = frontiers(
-            voxel_map, FRONTIER_CELLS, heights=(0.0, 2 * BAND), floor=height - BAND, start=ways.start, radius=0.2
+            voxel_map, FRONTIER_CELLS, heights=(0.0, 2 * BAND), floor=height - BAND, start=planner.start, radius=0.2
         )
-        best, shortest = None, np.inf
-        for one in found:
-            if any(np.linalg.norm(one.centroid - place) < SAME_M for place in self._looked):
-                continue
-            path = None if one.look_from is None else ways.path_to(one.look_from, NEARER_M)
-            if path is None:
-                continue
-            length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() + np.linalg.norm(one.centroid - target)
-            if length < shortest:
-                best, shortest = (path, one.centroid), length
-        if best is not None:
-            self._looked.append(best[1])
-        return best
+        for near in NEAR_M:
+            routes = []
+            for one in found:
+                path = None if one.look_from is None else planner.path_to(one.look_from, near)
+                if path is not None and not any(look.settles(one.centroid) for look in self._looks):
+                    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+                    routes.append((float(length + np.linalg.norm(one.centroid - target)), path, one.centroid))
+            if routes:
+                _, path, place = min(routes, key=lambda route: route[0])
+                self._looks.append(_Look(place, path[-1]))
+                return path, place
+        return None
+
+    def _look(self, here: NDArray[np.float64]) -> None:
+        """Record whether the last frontier was looked at, or how often the path to it was abandoned."""
+        if self._looks and not self._looks[-1].tries:
+            last = self._looks[-1]
+            arrived = np.linalg.norm((here - last.end)[:2]) < NEARER_M
+            before = sum(look.tries for look in self._looks if np.linalg.norm(look.place - last.place) < SAME_M)
+            self._looks[-1] = last._replace(tries=TRIES if arrived else before + 1)
+
+
+class _Look(NamedTuple):
+    """A frontier (3,) to which a path led, and the path's end (3,).
+
+    tries: TRIES if it was looked at, else how many paths there were abandoned; 0 until the next call.
+    """
+
+    place: NDArray[np.float64]
+    end: NDArray[np.float64]
+    tries: int = 0
+
+    def settles(self, place: NDArray[np.float64]) -> bool:
+        """Return whether a frontier there need not be looked at again."""
+        return self.tries >= TRIES and bool(np.linalg.norm(place - self.place) < SAME_M)
 
 
 def _room(free: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.correct.corrected_poses import SLIGHT, OdometryJumps, noticeable, poses_by_path
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Cloud, Frame, Range
+from stereovox.frame import Frame, Rays
 from stereovox.geometry.se3 import Transform, inverse
 from stereovox.mapping.rebuild import FrameKey
 from stereovox.maps.record.kept_frames import KeptFrame
@@ -34,7 +34,7 @@ AGAIN_S = 10.0
 class Corrector(Protocol):
     """Records the frames of the map, and requests corrections."""
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud | Range, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Rays, in_map: bool) -> None:
         """Record a frame that has a pose. frame_id: the frame of its message."""
         ...
 
@@ -64,7 +64,7 @@ class PathCorrections:
         self._mapping, self._poses, self._log = mapping, poses, log
         self._sensors: dict[str, str] = {}
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud | Range, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Rays, in_map: bool) -> None:
         """Remember the frame of a topic's messages."""
         self._sensors[sensor.topic] = frame_id
         if sensor.topic == self._first and not self._body:
@@ -124,7 +124,7 @@ class JumpCorrections:
         self._mapping, self._poses, self._odom, self._log = mapping, poses, frame_name(odom), log
         self._jumps = OdometryJumps(min(mapping.config.cell), mapping.config.max_range)
 
-    def seen(self, sensor: Input, frame_id: str, frame: Frame | Cloud | Range, in_map: bool) -> None:
+    def seen(self, sensor: Input, frame_id: str, frame: Frame | Rays, in_map: bool) -> None:
         """Request a correction when a frame shows that a jump has ended."""
         try:
             T_odom_sensor = self._place(frame_id, frame.stamp_ns)

@@ -178,7 +178,7 @@ def pose_source(node: Any, config: Config, options: Options, late: Late = never_
 def inputs_of(options: Options, dimensions: int) -> list[Input]:
     """Return the topics to map."""
     depth = [DepthInput(*split_pair(text)) for text in options.depth]
-    ranges = [RangeInput(topic, options.silence_clears) for topic in options.range]
+    ranges = [RangeInput(topic, options.range_sigma, options.silence_clears) for topic in options.range]
     if dimensions == 2:
         return [*depth, *ranges, *map(FloorCloudInput, options.cloud), *map(ScanInput, options.scan)]
     clouds = [CloudInput(topic, options.ranges.lidar) for topic in options.cloud]

@@ -85,7 +85,7 @@ class DepthTopic:
     def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
         """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
 
-        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, and `no_pose` for an image of another camera, with
+        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, and `no_camera` for an image of another one, with
         `name` in the message.
         """
         picture = read_picture(self._file, self.topic, i, name)
@@ -98,10 +98,10 @@ class DepthTopic:
 
 
 def check_frame(frame_id: str, expected: str, name: str) -> None:
-    """Raise FrameRefused `no_pose` for an image in another frame than its topic's first one ("": unknown)."""
+    """Raise FrameRefused `no_camera` for an image in another frame than its topic's first one ("": unknown)."""
     if expected and frame_name(frame_id) != frame_name(expected):
         said = f"it is in frame '{frame_name(frame_id)}', the camera of its topic in '{frame_name(expected)}'"
-        raise FrameRefused("no_pose", f"{name}: {said}; give each camera a topic of its own")
+        raise FrameRefused("no_camera", f"{name}: {said}; give each camera a topic of its own")
 
 
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:

@@ -94,7 +94,8 @@ class Bag(DepthSource):
     time; /tf for the images' frame takes precedence, and holds for up to 0.1 s at its ends (`pose_off_ns`). It is the
     pose of the depth camera's optical frame unless `axes` differs; for poses of another camera,
     or in another file, use a camera pair (`pair.toml`).
-    Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file`, which keep the depth image.
+    Faults: `unreadable`, `bad_dtype`, `bad_shape`, `no_camera`; `no_pose` and `bad_pose_file`, which keep the
+        depth image.
     Raises SourceError for files that are empty, damaged or without usable depth, and for bad options.
     """
 

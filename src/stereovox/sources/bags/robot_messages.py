@@ -117,14 +117,15 @@ def read_range(wire: Wire) -> RangeReading:
     wire.number("B")  # ultrasound or infrared: both are a cone
     beam, least, most, distance = wire.numbers("f", 4)
     variance = wire.number("f") if wire.left >= 4 else 0.0  # newer than ROS 2 Humble
-    if not (np.isfinite([beam, least, most]).all() and 0 <= least <= most and most > 0 and 0 <= beam <= np.pi):
+    is_cone = np.isfinite(beam) and 0 <= beam <= np.float32(np.pi)
+    if not (is_cone and np.isfinite([least, most]).all() and 0 <= least <= most and most > 0):
         raise ValueError(
             f"a range between min_range {least:g} and max_range {most:g} with field_of_view {beam:g} is invalid"
         )
     if isfinite(distance):
         distance = inf if distance == most else distance if least <= distance < most else nan
     sigma = sqrt(variance) if 0 < variance < inf else 0.0
-    return RangeReading(stamp_ns, frame_id, distance, beam, least, most, sigma)
+    return RangeReading(stamp_ns, frame_id, distance, min(beam, np.pi), least, most, sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,8 +41,9 @@ SURVEYED = 20
 TOP, GAP, SPIKE, FEWEST = 0.998, 0.75, 0.005, 20
 """Marks of "no echo" are within 0.2 % of the largest range; this share of the beams, and so many of them at least, are
 there, and not one between three quarters of that range and it."""
-CONSTANT = 0.95
-"""Share of these that are the same number in scans whose limits are known: the wall behind a door never is."""
+CONSTANT, STEPS = 0.95, 3
+"""Share of these that are the same number in scans whose limits are known, although these 0.2 % hold several steps of
+the ranges: the wall behind a door is seen from different places, with noise."""
 MAX_ATTEMPTS = 5
 """Messages tried before a topic counts as unreadable."""
 
@@ -75,13 +76,30 @@ class ScanTopic:
             return self._note_of_mark()
         share = f"{100 * beyond / sum(len(scan.ranges) for scan in scans):.0f} % of the ranges of {self.topic}"
         cure = f"if they mean that nothing is there, give ?range_max={scans[0].range_max:g}"
-        return (f"{self.path}: {share} are beyond its range_max and are discarded; {cure}",)
+        note = f"{self.path}: {share} are beyond its range_max and are discarded; {cure}"
+        return (note, *self._note_of_mark())
+
+    @property
+    def notes_of_times(self) -> tuple[str, ...]:
+        """A line if clouds are assumed to be measured at once, or their times are unusual."""
+        if not self.is_cloud or not len(self):
+            return ()
+        try:
+            message = self.read(0)
+        except FrameRefused:
+            return ()
+        name = f"{self.path.name} {self.topic}"
+        if isinstance(message, PointCloud) and message.times:
+            return (f"{name}: times of its points are {message.times}; if that is wrong, add ?deskew=0",)
+        if isinstance(message, PointCloud) and message.times_s is None and not message.fault:
+            return (f"{name}: its points have no times, so each cloud counts as measured at once",)
+        return ()
 
     def _note_of_mark(self) -> tuple[str, ...]:
         if not isfinite(self._mark):
             return ()
         said = f"ranges of {self.topic} from {self._mark:.4g} m on are taken as a mark of no echo and are discarded"
-        return (f"{self.path}: {said}; if that is wrong, give ?range_max=",)
+        return (f"{self.path}: {said}; if they are walls, give the lidar's own ?range_max=METRES",)
 
     @cached_property
     def _mark(self) -> float:
@@ -94,8 +112,11 @@ class ScanTopic:
                 found.append(read_laser_scan(self._file.read(self.topic, i)).ranges)
         ranges = np.concatenate([one[np.isfinite(one)] for one in found] or [np.empty(0, np.float32)])
         mark = spike_of(ranges)
-        _, counts = np.unique(ranges[ranges >= (mark or inf)], return_counts=True)
-        return mark if mark and counts.max() >= CONSTANT * counts.sum() else inf
+        values, counts = np.unique(ranges, return_counts=True)
+        top = counts[values >= (mark or inf)]
+        if not len(top) or len(values) < 2 or np.diff(values).min() > (1 - TOP) / STEPS * values[-1]:
+            return inf
+        return mark if top.max() >= CONSTANT * top.sum() else inf
 
     def name(self, i: int) -> str:
         """Return the name of scan `i` for messages."""
@@ -112,10 +133,6 @@ class ScanTopic:
             with suppress(FrameRefused, ValueError):
                 found.add(self._file.read(self.topic, i).header()[0] or self.recorded_ns(i))
         return sorted(found)
-
-    def topic_of(self, i: int) -> str:
-        """Return the topic of scan `i`."""
-        return self.topic
 
     def read(self, i: int) -> LaserScan | PointCloud | RangeReading:
         """Return scan `i`, with the time of recording if it has none; raises FrameRefused `unreadable`."""
@@ -146,18 +163,26 @@ def _without_mark(scan: LaserScan, mark: float) -> LaserScan:
 
 
 class ScanTopics:
-    """Several topics of one kind as one, in order of recording; its members are those of `ScanTopic`."""
+    """One or several topics of one kind, in order of recording.
 
-    def __init__(self, topics: list[ScanTopic]):
-        self.topic, self.is_cloud = ",".join(one.topic for one in topics), topics[0].is_cloud
-        self.frame_id, self.notes = topics[0].frame_id, tuple(note for one in topics for note in one.notes)
-        self._topics = topics
+    topics: their names. frame_id: frame of the first, frame_ids: of each, "" if unnamed.
+    """
+
+    def __init__(self, file: BagFile, topics: list[str], range_max: float = 0.0):
+        self.topics, self._topics = topics, [ScanTopic(file, topic, range_max) for topic in topics]
+        self.is_cloud, self.frame_ids = self._topics[0].is_cloud, [one.frame_id for one in self._topics]
+        self.frame_id = self.frame_ids[0]
         self._order = sorted(
-            (one.recorded_ns(i), number, i) for number, one in enumerate(topics) for i in range(len(one))
+            (one.recorded_ns(i), number, i) for number, one in enumerate(self._topics) for i in range(len(one))
         )
 
     def __len__(self) -> int:
         return len(self._order)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of their ranges and times; each is one line."""
+        return tuple(note for one in self._topics for note in (*one.notes, *one.notes_of_times))
 
     def name(self, i: int) -> str:
         """Return the name of scan `i` for messages."""
@@ -173,7 +198,7 @@ class ScanTopics:
 
     def topic_of(self, i: int) -> str:
         """Return the topic of scan `i`."""
-        return self._at(i, ScanTopic.topic_of)
+        return self.topics[self._order[i][1]]
 
     def read(self, i: int) -> LaserScan | PointCloud | RangeReading:
         """Return scan `i` as `ScanTopic.read` does."""

@@ -156,7 +156,7 @@ class WithCamera(Changed):
         if isinstance(frame, StereoFrame):
             raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
         if isinstance(frame, Rays):
-            raise SourceError(f"{self.name}: has no images, which no camera file fits; leave it out")
+            raise SourceError(f"{self.name}: has no images, so a camera file does not apply; leave it out")
         return replace(frame, camera=self.camera)
 
 

@@ -19,7 +19,7 @@ from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
 from stereovox.sources.bags.recording import PosedSensor, TurnedTf, file_part, read_poses
 from stereovox.sources.bags.robot_messages import CLOUDS, LASER_SCAN, RANGE, LaserScan, PointCloud, RangeReading
-from stereovox.sources.bags.scans import ScanTopic, ScanTopics, check_topic
+from stereovox.sources.bags.scans import ScanTopics, check_topic
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.parameters import mounted
 
@@ -75,6 +75,7 @@ class BagClouds(CloudSource):
         if len(given) != 1:
             raise SourceError(f"{where}: has {' and '.join(given)}; give one of ?cloud=, ?scan= and ?range=")
         ((key, topics),) = given.items()
+        self._refuse_unused(where, key)
         self._file = open_bag(Path(path))
         self._scans = self._topics(key, topics)
         self.name, self.lidar = f"{Path(path).name} {topics}", self._options.lidar
@@ -84,15 +85,25 @@ class BagClouds(CloudSource):
         sensor = PosedSensor(self._scans.frame_id, "" if self._options.mount else MOUNT, self._scans.taken_ns)
         self._poses, self._missing, notes = read_poses(self._file, options, sensor)
         self._refuse_world()
-        self.notes = (*self._file.notes, *notes, *self._note_of_times(), *self._scans.notes)
+        self.notes = (*self._file.notes, *notes, *self._scans.notes)
         self.posed = self._poses is not None
 
-    def _topics(self, key: str, names: str) -> ScanTopic | ScanTopics:
-        found = list[ScanTopic]()
-        for topic in names.split(","):
+    def _refuse_unused(self, where: str, key: str) -> None:
+        """Raise SourceError for options that this kind of topic does not use."""
+        unused = ("range_min", "range_max", "deskew") if key == "range" else ("silence_clears",)
+        for name in unused:
+            if getattr(self._options, name) != getattr(Options(), name):
+                raise SourceError(f"{where}: {name}= is not for ?{key}=; leave it out")
+
+    def _topics(self, key: str, names: str) -> ScanTopics:
+        topics = names.split(",")
+        for topic in topics:
             check_topic(self._file, topic, TOPICS[key], key)
-            found.append(ScanTopic(self._file, topic, self._options.range_max))
-        return found[0] if len(found) == 1 else ScanTopics(found)
+        found = ScanTopics(self._file, topics, self._options.range_max)
+        if len(topics) > 1 and (len(set(topics)) < len(topics) or self._options.mount or not all(found.frame_ids)):
+            said = "several topics must differ, name their frames and have their mounts in /tf"
+            raise SourceError(f"{self._file.path}: ?{key}={names}: {said}; give one of them")
+        return found
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -127,9 +138,9 @@ class BagClouds(CloudSource):
             found, T_world_sensor=T, stamp_ns=message.stamp_ns, name=self.file(i), sensor=self._scans.topic_of(i),
             pose_off_ns=self._off_ns(message.frame_id, message.stamp_ns),
         )  # fmt: skip
-        times = None
         if isinstance(found, Range):
             return found
+        times = None
         if isinstance(message, PointCloud) and self._options.deskew:
             if message.fault:
                 detail = f"{self.file(i)}: {message.fault}; add ?deskew=0 for clouds measured at once"
@@ -146,7 +157,7 @@ class BagClouds(CloudSource):
             return replace(found, poses=found.poses.of(frame_id)).at(stamp_ns)
         if frame_id != self._scans.frame_id:
             said = f"this cloud is in frame '{frame_id}', the poses are those of '{self._scans.frame_id}'"
-            raise FrameRefused("no_pose", f"{self._scans.topic}: {said}; record /tf_static, or leave it out")
+            raise FrameRefused("no_pose", f"{self._scans.topics[0]}: {said}; record /tf_static, or leave it out")
         return found.at(stamp_ns) @ self._T_body_lidar
 
     def _off_ns(self, frame_id: str, stamp_ns: int) -> int:
@@ -160,27 +171,14 @@ class BagClouds(CloudSource):
         """
         if not isinstance(self._poses, TurnedTf):
             return
-        tf, world, body = self._poses.poses.tf, self._poses.poses.world, self._scans.frame_id
-        if self._poses.poses.edge is not None or tf.moving(world, body):
-            return
+        tf, world = self._poses.poses.tf, self._poses.poses.world
         moving = next((name for name in tf.frames if tf.connected(world, name) and tf.moving(world, name)), None)
-        if moving:
-            said = f"{self._scans.topic} is in frame '{body}', in which {moving} moves, so its rays have no origin"
-            raise SourceError(f"{self._file.path}: {said}; name the lidar's own topic")
-
-    def _note_of_times(self) -> tuple[str, ...]:
-        """Return a note if clouds are assumed to be measured at once."""
-        if not self._scans.is_cloud or not len(self._scans):
-            return ()
-        try:
-            message = self._scans.read(0)
-        except FrameRefused:
-            return ()
-        if isinstance(message, PointCloud) and message.times:
-            return (f"{self.name}: times of its points are {message.times}; if that is wrong, add ?deskew=0",)
-        if isinstance(message, PointCloud) and message.times_s is None and not message.fault:
-            return (f"{self.name}: its points have no times, so each cloud counts as measured at once",)
-        return ()
+        if self._poses.poses.edge is not None or not moving:
+            return
+        for topic, body in zip(self._scans.topics, self._scans.frame_ids, strict=True):
+            if not tf.moving(world, body):
+                said = f"{topic} is in frame '{body}', in which {moving} moves, so its rays have no origin"
+                raise SourceError(f"{self._file.path}: {said}; name the lidar's own topic")
 
 
 def range_of_reading(reading: RangeReading, sigma: float = 0.0, silence_clears: bool = False) -> Range:

@@ -5,7 +5,7 @@ from threading import Event
 import numpy as np
 import pytest
 
-from stereovox import Cloud, Mapper, MapRun, ObstacleSender, StereovoxError, open_source
+from stereovox import Cloud, Mapper, MapRun, ObstacleSender, Range, StereovoxError, open_source
 from stereovox.geometry.se3 import inverse
 from stereovox.mavlink.directions import DirectionRules
 from stereovox.mavlink.link import MavlinkLink
@@ -226,6 +226,17 @@ def test_a_lidar_looks_along_its_own_axes(start_autopilot, mapped):
             heard.append(autopilot.wait_for("OBSTACLE_DISTANCE")[0]["distances"])
         autopilot.drain()
     assert heard[0] == heard[1]
+
+
+def test_a_sonar_gives_a_pose_only_if_its_mount_is_named(start_autopilot, mapped):
+    """It may look to the side: the body would be turned, and its sectors with it."""
+    mapper, _, report = mapped
+    mount, taken = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]), []
+    for mounts in ({}, {"sonar": mount}):
+        with ObstacleSender(mapper, start_autopilot().url, rate_hz=None, rules=RULES, mounts=mounts) as sender:
+            sender.at = lambda T, *_, **__: taken.append(T)
+            sender.after(Range(1.0, mount, sensor="sonar"), report)
+    np.testing.assert_allclose(taken, [np.eye(4)])
 
 
 class Told(ObstacleSender):

@@ -12,6 +12,7 @@ import stereovox as sv
 from stereovox.cli import main
 from stereovox.depth.cloud import sweep_times
 from stereovox.errors import NoPoses, SourceError
+from stereovox.runs.survey import survey
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import read_point_cloud
 from stereovox.sources.poses.trajectory import write_trajectory
@@ -424,6 +425,18 @@ def test_options_that_ranges_do_not_use_are_refused(tmp_path, options, why):
     bag = write_sonars(tmp_path / "sonars.bag", [1.0, 1.0])
     with pytest.raises(SourceError, match=why):
         sv.open_source(f"{bag}?{options}")
+
+
+def test_ranges_without_poses_are_ranges_all_the_same(tmp_path):
+    with RobotBagMaker(tmp_path / "a.bag") as bag:
+        for n in range(3):
+            stamp = START_NS + 100 * n * MS
+            message = bag.make("sensor_msgs/Range", header=bag.header(stamp, "left"), radiation_type=0, range=1.0,
+                               field_of_view=np.float32(np.pi), min_range=0.2, max_range=3.0)  # fmt: skip
+            bag.add("/left", "sensor_msgs/Range", stamp, message)
+    source = sv.open_source(f"{tmp_path / 'a.bag'}?range=/left")
+    assert [(type(one), one.fault) for one in source] == [(sv.Range, "no_pose")] * 3
+    assert survey(source).kind == "range"
 
 
 def test_a_second_topic_in_the_worlds_own_frame_is_refused(tmp_path):

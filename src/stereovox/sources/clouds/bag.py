@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from math import inf
+from math import inf, nan
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +147,10 @@ class BagClouds(CloudSource):
                 raise FrameRefused("no_pose", detail)
             times = message.times_s
         return found if times is None else deskewed(found, times, pose_at)
+
+    def blank(self) -> Cloud | Range:
+        """Return a cloud, or of a topic of ranges one of these, without values and pose."""
+        return Range(nan, np.full((4, 4), np.nan)) if self._options.range else super().blank()
 
     def _pose_at(self, frame_id: str, stamp_ns: int) -> np.ndarray:
         """Return the pose of a sensor that publishes on the topic; a topic may carry those of several sensors."""

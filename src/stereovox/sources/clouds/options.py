@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
@@ -102,7 +102,9 @@ class CloudSource(Source):
         try:
             return self.cloud(i)
         except FrameRefused as refused:
-            return Cloud(
-                np.empty((0, 3), np.float32), np.full((4, 4), np.nan), self.stamp_ns(i), self.lidar,
-                name=str(self.file(i)), fault=refused.reason, fault_detail=str(refused),
-            )  # fmt: skip
+            told = {"fault": refused.reason, "fault_detail": str(refused)}
+            return replace(self.blank(), stamp_ns=self.stamp_ns(i), name=str(self.file(i)), **told)
+
+    def blank(self) -> Cloud | Range:
+        """Return a cloud without points and pose."""
+        return Cloud(np.empty((0, 3), np.float32), np.full((4, 4), np.nan), lidar=self.lidar)

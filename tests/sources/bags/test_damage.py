@@ -22,7 +22,7 @@ from stereovox.sources.bags.messages import Wire, read_camera_info, read_image
 from stereovox.sources.bags.recording import Bag as BagSource
 
 TOPIC, INFO = "/depth/image", "/depth/camera_info"
-FAULTS = {None, "unreadable", "bad_dtype", "bad_shape", "no_pose", "bad_pose_file"}
+FAULTS = {None, "unreadable", "bad_dtype", "bad_shape", "no_camera", "no_pose", "bad_pose_file"}
 ENOUGH = 30_000_000
 
 

@@ -18,22 +18,8 @@ from stereovox.maps.record.history import Imported
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.products.floor.floor_heights import FloorHeights
 
-CLOUDS = (
-    ".ply",
-    ".pcd",
-    ".las",
-    ".laz",
-    ".xyz",
-    ".csv",
-    ".txt",
-    ".asc",
-    ".pts",
-    ".ptx",
-    ".bin",
-    ".stl",
-    ".obj",
-    ".off",
-)
+CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".ptx", ".bin", ".stl", ".obj",
+          ".off")  # fmt: skip
 """Endings of point clouds and meshes."""
 FLOORS = (".yaml", ".yml", ".pgm", ".png", ".bmp")
 """Endings of 2-D maps that can be read."""

@@ -87,6 +87,11 @@ def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
     return np.array([np.interp(metres, at, points[:, axis]) for axis in range(3)])
 
 
+def path_length(path: NDArray[np.floating]) -> float:
+    """Return the length of a path (N, 3) in metres."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+
 def _free_share(
     voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, blocking: list[State]
 ) -> float:

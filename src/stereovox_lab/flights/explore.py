@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.level_ways import LevelPlanner, Waypoints
-from stereovox.products.frontiers import Frontier, frontiers
-from stereovox.products.path_check import check_path, point_along
+from stereovox.products.floor.level_ways import Leg, LevelPlanner, Waypoints, frontiers_around
+from stereovox.products.frontiers import Frontier
+from stereovox.products.path_check import check_path, path_length, point_along
 from stereovox_lab.flights.air import Air
 from stereovox_lab.flights.flight import STEP_S, World
 from stereovox_lab.flights.quadrotor import Airframe, Quadrotor
@@ -90,9 +90,7 @@ class Mission(Protocol):
 
     left: dict[str, int]
 
-    def next(
-        self, voxel_map: VoxelMap, planner: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
         """Return a path (N, 3) and the place (3,) to look at from its end, NaN to look all around; None when done."""
         ...
 
@@ -105,9 +103,7 @@ class MiddleOfRoom:
         self.room_m = 0.0
         self.left: dict[str, int] = {}
 
-    def next(
-        self, voxel_map: VoxelMap, planner: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
         """Return the path to the middle as currently known."""
         found = planner.middle()
         if found is None or not self._looks_left or np.linalg.norm(found[0] - self._last) < 2 * ARRIVED:
@@ -121,27 +117,16 @@ class Frontiers:
     """Explore: go to the frontier nearest along the path and look at it; if none is reachable, look all around from as
     near as possible to one, the largest first, until that was in vain ROUNDS times."""
 
-    def __init__(self, smallest: int = 15, band: float = 0.6):
-        self._smallest, self._band = smallest, band
+    def __init__(self) -> None:
         self._looks: list[tuple[NDArray[np.float64], NDArray[np.float64], bool]] = []
         self._rounds: list[NDArray[np.float64]] = []
         self._in_vain = 0
         self.left: dict[str, int] = {}
 
-    def next(
-        self, voxel_map: VoxelMap, planner: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
         """Return the path to the nearest frontier's viewpoint, or to a place to look all around."""
         self._rounds = self._rounds or [planner.start]  # it turned once at the start
-        height = planner.start[2]
-        found = frontiers(
-            voxel_map,
-            self._smallest,
-            heights=(0.0, 2 * self._band),
-            floor=height - self._band,
-            start=planner.start,
-            radius=0.2,
-        )
+        found = frontiers_around(voxel_map, planner)
         if self._looks:  # the last was seen only if it reached the end of the path
             place, end, _ = self._looks[-1]
             self._looks[-1] = place, end, bool(np.linalg.norm((planner.start - end)[:2]) < 2 * ARRIVED)
@@ -164,22 +149,18 @@ class Frontiers:
         ]
         return any(same) or len(same) >= TRIES
 
-    def _nearest(
-        self, found: list[Frontier], planner: LevelPlanner, near: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def _nearest(self, found: list[Frontier], planner: LevelPlanner, near: float) -> Leg | None:
         """Return the shortest path to within `near` metres of a frontier's viewpoint, and the frontier's middle."""
-        best: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        best: Leg | None = None
         for one in found:
             way = None if one.look_from is None else planner.path_to(one.look_from, near)
             if way is None or self._is_done(one.centroid, way[-1]):
                 continue
-            if best is None or _length(way) < _length(best[0]):
+            if best is None or path_length(way) < path_length(best[0]):
                 best = way, one.centroid
         return best
 
-    def _round(
-        self, found: list[Frontier], planner: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def _round(self, found: list[Frontier], planner: LevelPlanner) -> Leg | None:
         """Return the path to a look around from as near as possible to a frontier, the largest first."""
         for one in found:
             way = planner.path_to(one.centroid, inf)
@@ -190,14 +171,12 @@ class Frontiers:
 
     def _why_left(self, found: list[Frontier], planner: LevelPlanner) -> dict[str, int]:
         """Count the remaining frontiers, by the reason they are not goals."""
-        why = [
-            UNSEEN
-            if one.look_from is None
-            else NO_WAY
-            if planner.path_to(one.look_from, SHORT_M) is None
-            else LOOKED_AT
-            for one in found
-        ]
+        why = []
+        for one in found:
+            if one.look_from is None:
+                why.append(UNSEEN)
+            else:
+                why.append(NO_WAY if planner.path_to(one.look_from, SHORT_M) is None else LOOKED_AT)
         return {reason: why.count(reason) for reason in (UNSEEN, NO_WAY, LOOKED_AT)}
 
 
@@ -347,13 +326,15 @@ class _Mission:
         target = point_along(self._way, along + AHEAD)
         off = _turn(quad.yaw, target - quad.position)
         rate = float(np.clip(2 * off, -cruise.turn, cruise.turn))
-        if _length(self._way) - along < ARRIVED or not self._free_ahead(now, along):
+        if path_length(self._way) - along < ARRIVED or not self._free_ahead(now, along):
             self._way, rate = None, 0.0
             self._look_left = 2 * np.pi if np.isnan(self._look_at).any() else 1.0
         flown = np.zeros(2)
         if self._way is not None and abs(off) < FACING:
             step = (target - quad.position)[:2]
-            flown = step / max(float(np.linalg.norm(step)), 1e-9) * min(cruise.speed, _length(self._way) - along + 0.1)
+            flown = (
+                step / max(float(np.linalg.norm(step)), 1e-9) * min(cruise.speed, path_length(self._way) - along + 0.1)
+            )
         quad.step(flown, self._height, rate, STEP_S)
 
     def _turning(self) -> float:
@@ -372,15 +353,11 @@ class _Mission:
         if self._way is None or now - self._checked < CHECK_S:
             return True
         self._checked, cruise = now, self._cruise
-        start, end = along + cruise.own_radius, min(along + cruise.own_radius + CHECK_M, _length(self._way))
+        start, end = along + cruise.own_radius, min(along + cruise.own_radius + CHECK_M, path_length(self._way))
         if end <= start:
             return True
         places = [point_along(self._way, metres) for metres in np.linspace(start, end, 6)]
         return check_path(self._mapper.map, places, cruise.airframe.radius).free
-
-
-def _length(way: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
 
 
 def _passed(way: NDArray[np.float64], place: NDArray[np.float64]) -> float:

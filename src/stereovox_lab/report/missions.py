@@ -25,10 +25,9 @@ WHAT = (
     "A collision: a surface of the scene is nearer to the vehicle's middle than its radius. Clearance: the least "
     "distance from its middle to a surface. Air: the cells of the scene that touch nothing, have something above and "
     "below them, and are connected with the start; known: the map calls them free. Ended by itself: no goal was left; "
-    "else time was up, or it collided. Goals left: frontiers (known air next to unknown) "
-    "or waypoints if it ended by itself, and why it did not go there; if there is no path, a smaller margin or smaller "
-    "cells may find one. Room: horizontal "
-    "distance to the nearest surface in the vehicle's heights."
+    "else time was up, or it collided. Goals left: frontiers (known air next to unknown) or "
+    "waypoints if it ended by itself, and why it did not go there; if there is no path, a smaller margin or smaller "
+    "cells may find one. Room: horizontal distance to the nearest surface in the vehicle's heights."
 )
 
 

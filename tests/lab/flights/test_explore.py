@@ -63,7 +63,7 @@ def done(mission, ways):
 def one_frontier(monkeypatch):
     """Let every map have one frontier at x = 6 m, seen from x = 5 m."""
     found = [Frontier(np.zeros((20, 3), np.int32), np.array([6.0, 0, 1]), np.array([5.0, 0, 1]))]
-    monkeypatch.setattr(explore, "frontiers", lambda *words, **more: found)
+    monkeypatch.setattr(explore, "frontiers_around", lambda *words: found)
     return found
 
 

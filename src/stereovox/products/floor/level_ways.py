@@ -14,7 +14,8 @@ from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import shown
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.query.queries import points_of
-from stereovox.products.frontiers import frontiers
+from stereovox.products.frontiers import Frontier, frontiers
+from stereovox.products.path_check import path_length
 
 CLEAR = 0.3
 """A step costs its length times 1 + this (metres) over the clearance: paths keep to the middle."""
@@ -180,9 +181,7 @@ class Waypoints:
         self._current, self._tries, self._best = 0, 0, np.inf
         self._looks: list[_Look] = []
 
-    def next(
-        self, voxel_map: VoxelMap, planner: LevelPlanner
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def next(self, voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
         """Return the next path.
 
         Args:
@@ -235,17 +234,15 @@ class Waypoints:
 
     def _explore(self, target: NDArray[np.float64], voxel_map: VoxelMap, planner: LevelPlanner) -> Leg | None:
         """Return the path to the frontier with the shortest route to a place, of those not looked at."""
-        height = planner.start[2]
-        found = frontiers(
-            voxel_map, FRONTIER_CELLS, heights=(0.0, 2 * BAND), floor=height - BAND, start=planner.start, radius=0.2
-        )
+        found = frontiers_around(voxel_map, planner)
+        left = [one for one in found if not any(look.settles(one.centroid) for look in self._looks)]
         for near in NEAR_M:
             routes = []
-            for one in found:
+            for one in left:
                 path = None if one.look_from is None else planner.path_to(one.look_from, near)
-                if path is not None and not any(look.settles(one.centroid) for look in self._looks):
-                    length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-                    routes.append((float(length + np.linalg.norm(one.centroid - target)), path, one.centroid))
+                if path is not None:
+                    away = float(np.linalg.norm(one.centroid - target))
+                    routes.append((path_length(path) + away, path, one.centroid))
             if routes:
                 _, path, place = min(routes, key=lambda route: route[0])
                 self._looks.append(_Look(place, path[-1]))
@@ -274,6 +271,12 @@ class _Look(NamedTuple):
     def settles(self, place: NDArray[np.float64]) -> bool:
         """Return whether a frontier there need not be looked at again."""
         return self.tries >= TRIES and bool(np.linalg.norm(place - self.place) < SAME_M)
+
+
+def frontiers_around(voxel_map: VoxelMap, planner: LevelPlanner) -> list[Frontier]:
+    """Return the frontiers at about the height of the vehicle, as seen from free space that it reaches."""
+    heights, floor = (0.0, 2 * BAND), planner.start[2] - BAND
+    return frontiers(voxel_map, FRONTIER_CELLS, heights=heights, floor=floor, start=planner.start, radius=0.2)
 
 
 def _room(free: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,7 +65,7 @@ class RigSource(Source, ABC):
     @classmethod
     def depth_only(cls, where: str) -> Self:
         """Return the images without searching for poses: every pose is NaN."""
-        return cls(where, posed=False)  # pyrefly: ignore[bad-argument-count, unexpected-keyword] - each layout is constructed from its place
+        return cls(where, posed=False)  # pyrefly: ignore[bad-argument-count, unexpected-keyword] - by each layout
 
     def __len__(self) -> int:
         return len(self._shots)

@@ -156,15 +156,15 @@ class Tried:
 
     def _answers(self, things: Sequence[Any]) -> list[tuple[str | None, str]]:
         if len(things) == 1:
-            return [self._answer(things[0])]
-        running = [self._callers.submit(self._answer, thing) for thing in things]
+            return [self._answer(self.mapper, things[0])]
+        running = [self._callers.submit(self._answer, self.mapper, thing) for thing in things]
         self.mapper.map.state(np.zeros((4, 3))) if not self.kind.grid else None
         self.mapper.health()
         return [future.result() for future in running]
 
-    def _answer(self, thing: Any) -> tuple[str | None, str]:
+    def _answer(self, mapper: Any, thing: Any) -> tuple[str | None, str]:
         try:
-            report = self.mapper.add(thing)
+            report = mapper.add(thing)
         except ConfigError as error:
             return UNFIT, str(error)
         return report.refused, report.detail

@@ -24,6 +24,8 @@ By the clock alone, a call on a busy machine would count as hung. A call that wa
 """
 MEMORY = 4 << 30
 """Most memory of a batch in bytes."""
+RENEWED = 2
+"""Batches of a process: holes in its heap count against MEMORY."""
 NEVER = (float("inf"), float("inf"))
 LOOKS_S = 1.0
 PR_SET_PDEATHSIG = 1
@@ -114,11 +116,12 @@ def _work(
         return now % 100 > 0 or monotonic() < until
 
     warm_up([seed, batch, 0], kinds, odd, alive)
-    while batch * BATCH < frames and monotonic() < until:
-        seen = run(min(BATCH, frames - batch * BATCH), [seed, batch], 0, kinds, odd, alive)
+    for now in range(batch, batch + RENEWED):
+        if now * BATCH >= frames or monotonic() >= until:
+            break
+        seen = run(min(BATCH, frames - now * BATCH), [seed, now], 0, kinds, odd, alive)
         since[:] = NEVER
         tell.send((seen, _megabytes()))
-        batch += 1
 
 
 def _processor_s(pid: int | None) -> float:

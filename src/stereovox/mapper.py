@@ -303,6 +303,8 @@ class GridMapper(Aged):
         self.map = _grid_map(self.config, resume)
         self._intake = Intake(self.config, self.map, clock, stamp_clock)
         self._comparison = FloorComparison(self.config, self._intake.gate, isinstance(resume, OccupancyGrid))
+        if resume is None and self.config.trust.max_disagreement < 1:
+            self.map.history.unconfirmed = TRIES
 
     def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
@@ -328,10 +330,12 @@ class GridMapper(Aged):
                 passed = self._comparison.check(frame, scan, evidence, passed, self.map)
             with self.map.lock, uninterrupted():
                 self.map.storage.check_room(evidence)
+                if passed.takes_out:
+                    self.map.storage.begin_anew()
                 cells = self.map.add(evidence)
                 offer.accept(passed)
-            done = perf_counter()
-            offer.report = UpdateReport(1e3 * (prepared - started), 1e3 * (done - prepared), cells, detail=passed.note)
+            depth_ms, map_ms = 1e3 * (prepared - started), 1e3 * (perf_counter() - prepared)
+            offer.report = UpdateReport(depth_ms, map_ms, cells, detail=passed.note, taken_out=passed.takes_out)
         return offer.report
 
     def __repr__(self) -> str:

@@ -6,6 +6,7 @@ from math import floor, inf, isnan
 
 import numpy as np
 import pytest
+from bad_scans import FAULTS as BAD
 from bad_scans import Ground, changed, scans_of
 
 import stereovox as sv
@@ -321,3 +322,38 @@ def test_the_faults_of_a_plane_leave_points_in_it():
     for name, matrix in FLAT_FAULTS.items():
         np.testing.assert_allclose(matrix @ [0, 0, 1], [0, 0, 1], err_msg=name)
         np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
+
+
+OFF = ["x 0.8", "x 1.2", "turned by 30 deg", "pose 0.3 m off", "range + 0.3 m", "of another place"]
+
+
+@pytest.mark.parametrize("kind", OFF)
+def test_a_bad_first_scan_is_taken_out_by_the_second(ground, kind):
+    start = len(ground.scans) // 4
+    good = ground.scans[start + 1 : start + 4]
+    mapper = sv.GridMapper(**SETTINGS)
+    assert mapper.add(BAD[kind](ground.scans, start, start, np.random.default_rng(1))).refused is None
+    assert mapper.health().state == "waiting"
+    reports = [mapper.add(scan) for scan in good]
+    assert [report.taken_out for report in reports] == [1, 0, 0]
+    assert mapper.health().state == "current"
+    fresh = sv.GridMapper(**SETTINGS)
+    for scan in good:
+        fresh.add(scan)
+    for mine, theirs in zip(mapper.map.storage.tiles(), fresh.map.storage.tiles(), strict=True):
+        assert np.array_equal(mine, theirs)
+    assert (mapper.map.history.frames, dict(mapper.map.history.refused)) == (3, {"unconfirmed": 1})
+
+
+def test_good_first_scans_are_confirmed_by_the_second(ground):
+    for start in range(0, len(ground.scans) - 1, 40):
+        mapper = sv.GridMapper(**SETTINGS)
+        reports = [mapper.add(scan) for scan in ground.scans[start : start + 2]]
+        assert [report.taken_out for report in reports] == [0, 0]
+        assert mapper.health().state == "current"
+
+
+def test_without_a_comparison_a_first_scan_counts(ground):
+    mapper = sv.GridMapper(**SETTINGS, **{"trust.max_disagreement": 1})
+    mapper.add(ground.scans[0])
+    assert mapper.health().state == "current"

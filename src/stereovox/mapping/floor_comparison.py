@@ -13,8 +13,20 @@ from stereovox.config import Config
 from stereovox.frame import AnyFrame, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import Transform, rotation_matrix
-from stereovox.mapping.comparison import GAIN, TRIED, Placed, explained, sight, thinned
-from stereovox.mapping.disagreement import Sight
+from stereovox.mapping.comparison import (
+    CONFIRMED,
+    CONTRADICTED,
+    ENOUGH,
+    GAIN,
+    MOST,
+    OVERLAP,
+    TRIED,
+    Placed,
+    explained,
+    sight,
+    thinned,
+)
+from stereovox.mapping.disagreement import FEW, Sight
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps.cells.cell_format import State
 from stereovox.maps.cells.evidence import GridEvidence
@@ -77,11 +89,27 @@ class FloorComparison:
         if not self._prepared:  # once, so that kernels compile now and not when a scan is in doubt
             self._prepared = True
             self._sight(scan, None, grid_map)
+        if grid_map.history.is_provisional:
+            passed = self._confirmed(evidence, passed, grid_map)
+            if passed.takes_out:
+                return passed
         with grid_map.lock:
             against = grid_map.storage.agreement(evidence, self._around).against
             doubted = self._gate.in_doubt(passed, against)
             found = self._sight(scan, self._gate.doubt(passed), grid_map) if doubted else None
             return self._gate.check_agreement(frame, passed, against, found)
+
+    def _confirmed(self, evidence: GridEvidence, passed: GateResult, grid_map: GridMap) -> GateResult:
+        """Return the result for a scan whose map is of scans that none has confirmed, as `Comparison` does."""
+        with grid_map.lock:
+            met, frames = grid_map.storage.agreement(evidence, self._around, sure=False), grid_map.history.frames
+            enough = frames - grid_map.history.cones.total() >= ENOUGH
+        known = met.agree + met.into_free + met.through
+        if known < max(FEW, OVERLAP * met.every):
+            return passed._replace(confirms=enough)
+        if met.agree < (CONFIRMED if known >= MOST * met.every else CONTRADICTED) * known:
+            return passed._replace(takes_out=frames)
+        return passed._replace(confirms=enough or met.agree >= CONFIRMED * known)
 
     def _sight(self, scan: Scan, doubt: DisagreementSpell | None, grid_map: GridMap) -> Sight:
         """Return how a scan in doubt fits the grid."""

@@ -59,7 +59,16 @@ class GridStorage(Guarded):
         unknown, (free, _, occupied) = self.cell_format.unknown, map(np.int32, self.rules.sure)
         self._surface = np.int32(max(self.rules.prior, self.rules.thresholds.free_most, unknown) + 1)
         self._sure, self._counts = (np.int32(unknown), (self._surface, free), occupied), np.zeros(4, np.int64)
-        self._pool = BlockPool(self.cell_format.dtype, capacity=64, fill=self.cell_format.unknown, cells=CELLS)
+        self._any = np.int32(unknown), (self._surface, np.int32(self._surface - 1)), self._surface
+        self._pool = self._empty()
+
+    def _empty(self) -> BlockPool:
+        return BlockPool(self.cell_format.dtype, capacity=64, fill=self.cell_format.unknown, cells=CELLS)
+
+    def begin_anew(self) -> None:
+        """Empty the map, and its history, whose scans none has confirmed."""
+        self._pool = self._empty()
+        self.history.begin_anew()
 
     def continue_with(self, config: Config) -> None:
         """Adopt the settings of a run that continues the map; raises ConfigError if they change the cells' meaning."""
@@ -96,13 +105,17 @@ class GridStorage(Guarded):
                 f"more than max_memory {format_bytes(self.config.max_memory)}; allow more or use larger cells",
             )
 
-    def agreement(self, evidence: GridEvidence, around: int) -> BeamAgreement:
-        """Return how a scan agrees with what is surely known; `around`: cells from a surface that are on it."""
+    def agreement(self, evidence: GridEvidence, around: int, sure: bool = True) -> BeamAgreement:
+        """Return how a scan agrees with what is surely known, or with all that is known.
+
+        around: cells from a surface that are on it.
+        """
         if evidence.ends is None:
             return BeamAgreement(0, 0, 0, 0)
         pool, ends, counts = self._pool, evidence.ends, self._counts
         step = -(-len(ends) // BEAMS)
-        _grid.weigh(pool.table, pool.coords, pool.values, *self._sure, around, DEEP_CELLS, ends, step, counts)
+        limits = self._sure if sure else self._any
+        _grid.weigh(pool.table, pool.coords, pool.values, *limits, around, DEEP_CELLS, ends, step, counts)
         return BeamAgreement(*counts.tolist())
 
     def seen_at(self, indices: NDArray[np.int64], around: int) -> NDArray[np.uint8]:

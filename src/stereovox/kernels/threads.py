@@ -5,8 +5,8 @@ the newest request counts."""
 from __future__ import annotations
 
 import os
-import signal
 import threading
+from _signal import getsignal, signal  # those of `signal` make enumerations, which takes a tenth of a small frame
 from _thread import RLock
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import lru_cache, wraps
 from inspect import isgeneratorfunction
+from signal import SIGINT, default_int_handler
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -243,15 +244,15 @@ def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:
 def uninterrupted() -> Iterator[None]:
     """Delay Ctrl-C until the block is complete, so that a map is never half changed; then raise it."""
     on_main = threading.current_thread() is threading.main_thread()  # others are never interrupted
-    if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not on_main or getsignal(SIGINT) is not default_int_handler:
         yield
         return
     received: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    signal(SIGINT, lambda number, _: received.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal(SIGINT, default_int_handler)
         if received:  # even if the block failed
             raise KeyboardInterrupt
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import threading
-from _signal import getsignal, signal  # type: ignore[import]  # without enumerations, a tenth of a small frame
+from _signal import getsignal, signal  # pyrefly: ignore[missing-import] - without enumerations, so faster
 from _thread import RLock
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator

@@ -2,13 +2,14 @@
 """Which bad scans does a 2-D grid take in, how soon a changed world, and how many good scans are refused?
 
     python benchmarks/bad_scans.py SOURCE [SOURCE ...] [--voxel-size 0.05] [--starts 6] [--last 1 4 20] [--young S]
-                                   [--only good|faults|changes|cost] [--set key=value ...] [--json]
+                                   [--only good|faults|changes|cost|first] [--set key=value ...] [--json]
 
 SOURCE: a CARMEN log or bag, whose poses are corrected by SLAM first (kept in --tracks FOLDER, where that is given), or
 `sim:floor?plan=corridors&seed=1`, at its true poses. All scans are mapped one by one (good). Then a mapper goes on with
 that grid (--young: with one of the S seconds before) from several places, and after 3 s its scans are bad for the
 longest of --last: how many are accepted, and how many surely occupied cells are freed, which are not by good scans?
 Changes are of simulated floors only: furniture is moved, gone or come, a door is shut or open, people stand and walk.
+First: new grids begin with a good or a bad scan, and good ones follow: at which of these is the first taken out?
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ from stereovox.simulate.floors.plan import FloorPlan, block, post
 from stereovox.simulate.floors.view import cast
 
 BEFORE_S, AFTER_S = 3.0, 2.0
+GOOD = 12
+"""Good scans after the first of a grid."""
 SURE = 2.1
 """Log-odds of a cell that is surely occupied."""
 Fault = Callable[[Sequence[Scan], int, int, np.random.Generator], Scan]
@@ -334,12 +337,33 @@ def cost(scans: Sequence[Scan], **settings: Any) -> float:
     return spent[with_] / spent[without] - 1
 
 
+def first_scans(scans: Sequence[Scan], kind: str, starts: int, **settings: Any) -> dict[str, int]:
+    """Return what became of the first scan of new grids, which a fault, or none (`good`), has made."""
+    found = Counter[str]()
+    for start in np.linspace(5, len(scans) - GOOD - 1, starts).astype(int).tolist():
+        random, mapper = np.random.default_rng([start, 7]), sv.GridMapper(**settings)
+        began = max(start - 40, 0) if kind.startswith("frozen") else start
+        seen = scans[start] if kind == "good" else FAULTS[kind](scans, start, began, random)
+        refused, out, confirmed = mapper.add(seen).refused, 0, 0
+        for n in range(1, GOOD + 1):
+            out += bool(mapper.add(scans[start + n]).taken_out)
+            confirmed = confirmed or n * (not mapper.map.history.is_provisional)
+        ends = "" if confirmed == 1 else f", confirmed by {confirmed or 'none'}"
+        found["refused" if refused else f"taken out{ends}" if out else f"kept{ends}"] += 1
+    return dict(found)
+
+
 def rows(wanted: argparse.Namespace) -> Iterator[dict[str, Any]]:
     settings = {"voxel_size": wanted.voxel_size, "max_range": wanted.max_range, **overrides(wanted)}
     for source in wanted.source:
         scans = scans_of(source, wanted.tracks)
         if wanted.only == "cost":
             yield {"source": source, "cost": cost(scans, **settings)}
+            continue
+        if wanted.only == "first":
+            for kind in wanted.kinds or ("good", *FAULTS):
+                found = first_scans(scans, kind, wanted.starts, **settings)
+                yield {"source": source, "first": kind, **found}
             continue
         ground = Ground(scans, **settings)
         yield {"source": source, "good": len(scans), "refused": ground.refused()}
@@ -374,7 +398,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=6)
     parser.add_argument("--last", type=float, nargs="+", default=[1, 4, 20])
     parser.add_argument("--young", type=float)
-    parser.add_argument("--only", choices=["good", "faults", "changes", "cost"])
+    parser.add_argument("--only", choices=["good", "faults", "changes", "cost", "first"])
     parser.add_argument("--kinds", nargs="*", help="only these faults or changes")
     parser.add_argument("--seed", type=int, default=0, help="of the changes")
     parser.add_argument("--tracks", type=Path, help="folder that keeps what SLAM finds")

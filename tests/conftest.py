@@ -5,6 +5,7 @@ import gc
 import json
 import os
 import signal
+import sys
 
 import pytest
 from examples import example_runner
@@ -16,8 +17,9 @@ from stereovox.cli import main
 
 
 def pytest_configure():
-    """Let processes that tests start keep what they compile of the package: each needs half a second for it."""
+    """Keep what is compiled of tests (half a minute for each worker) and of the package, in processes started too."""
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 def pytest_xdist_make_scheduler(config, log):

@@ -28,7 +28,7 @@ import stereovox as sv
 from stereovox.formats.map_server import read_map_server
 from stereovox.geometry.se3 import look_at
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.scene import Scene, Solid, box, cylinder

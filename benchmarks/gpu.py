@@ -19,7 +19,7 @@ from numba import cuda
 
 import stereovox as sv
 from stereovox.maps.cells.cell_format import CellRules
-from stereovox.products.block_pairs import block_pairs
+from stereovox.products.blocks import block_pairs
 
 FIRST = 10
 

@@ -27,7 +27,7 @@ from typing import Any
 import psutil
 
 from stereovox.config import load_config
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.localize.robot_track import slam_robot
 from stereovox.opening import open_robot

@@ -38,7 +38,7 @@ import stereovox as sv
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.sphere import T_BODY_OPTICAL
-from stereovox.evaluate.summary import percentiles
+from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import UpdateReport
 from stereovox.geometry.se3 import Transform, inverse, rotation_vector
 from stereovox.live.rig import LiveCamera, mount_of

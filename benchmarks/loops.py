@@ -28,7 +28,7 @@ import stereovox as sv
 from stereovox.config import load_config, parse_value
 from stereovox.correct.loops.closer import Loop, LoopCloser
 from stereovox.correct.loops.drift import difference
-from stereovox.evaluate.trajectory.trajectory_score import score_trajectory
+from stereovox.evaluate.trajectory_score import score_trajectory
 from stereovox.geometry.se3 import inverse
 from stereovox.maps.record.kept_frames import KeptFrame
 from stereovox.simulate.simulation import Simulation

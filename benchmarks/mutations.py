@@ -124,7 +124,7 @@ def entrance() -> list[Mutation]:
 
 def outputs() -> list[Mutation]:
     """Cells of `products.context.OUTPUTS`."""
-    sectors, axes, planner = "mavlink/sectors.py", "products/floor/floor_axes.py", "products/floor/level_ways.py"
+    sectors, axes, planner = "mavlink/sectors.py", "products/floor_axes.py", "products/level_ways.py"
     octomap, live, shown = "formats/octomap.py", "live/outputs.py", "ros/outputs.py"
     maps, grids = "tests/products/test_map_operations.py", f"{CONTEXT},tests/products/test_projection.py"
     of_octomap, ways = "tests/formats/test_octomap.py", "tests/products/test_level_ways.py"
@@ -213,14 +213,12 @@ def outputs() -> list[Mutation]:
             "    if False:",
             f"tests/products/test_ground.py,{grids}",
         ),
-        Mutation("coarsen unknown", "products/coarsen.py", "(number == int(factor) ** 3) |", "(number > 0) |", maps),
-        Mutation(
-            "coarsen age", "products/coarsen.py", "    coarse.storage.take_history(voxel_map.storage)\n", "", maps
-        ),
-        Mutation("crop age", "products/crop.py", "    cropped.storage.take_history(voxel_map.storage)\n", "", maps),
+        Mutation("coarsen unknown", "products/edit.py", "(number == int(factor) ** 3) |", "(number > 0) |", maps),
+        Mutation("coarsen age", "products/edit.py", "    coarse.storage.take_history(voxel_map.storage)\n", "", maps),
+        Mutation("crop age", "products/edit.py", "    cropped.storage.take_history(voxel_map.storage)\n", "", maps),
         Mutation(
             "crop up",
-            "products/crop.py",
+            "products/edit.py",
             "VoxelMap(voxel_map.config)",
             'VoxelMap(voxel_map.config.model_copy(update={"up": "z"}))',
             maps,
@@ -270,21 +268,21 @@ def outputs() -> list[Mutation]:
         ),
         Mutation(
             "grid unknown",
-            "products/floor/projection.py",
+            "products/projection.py",
             "np.where((patch.marked != EMPTY) & may_show, shown, np.int8(UNKNOWN))",
             "np.where((patch.marked != EMPTY) & may_show, shown, np.int8(0))",
             grids,
         ),
         Mutation(
             "grid floor",
-            "products/floor/projection.py",
+            "products/projection.py",
             "may_show = (shown >= 100 * percent.free_below) | seen_free",
             "may_show = shown >= 0",
             grids,
         ),
         Mutation(
             "GridFile frame",
-            "products/floor/live_projection.py",
+            "products/projection.py",
             "self._canvas.corner * side",
             "0 * self._canvas.corner * side",
             "tests/products/test_live_projection.py",

@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from stereovox.config import load_config, parse_value
-from stereovox.evaluate.trajectory.trajectory import score_relations
+from stereovox.evaluate.trajectory import score_relations
 from stereovox.formats.map_server import write_map_server
 from stereovox.localize.slam.line_map import cloud_of
 from stereovox.localize.slam.loops import ClosureSearch

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config, parse_value
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory.trajectory_motions import angles_deg
-from stereovox.evaluate.trajectory.trajectory_score import score_trajectory
+from stereovox.evaluate.trajectory_score import angles_deg, score_trajectory
 from stereovox.frame import AnyFrame, Frame
 from stereovox.geometry.se3 import inverse, orthonormalise
 from stereovox.opening import open_source

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory.trajectory_motions import angles_deg
+from stereovox.evaluate.trajectory_score import angles_deg
 from stereovox.frame import AnyFrame, Frame
 from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source

@@ -5,7 +5,7 @@ import numpy as np
 
 import stereovox as sv
 from stereovox.formats.map_server import write_map_server
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 
 mapper = sv.GridMapper(voxel_size=0.05)
 for number in range(10):  # a lidar that drives forward in a corridor 2 m wide; replace this by yours

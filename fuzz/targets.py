@@ -34,7 +34,7 @@ from mutate import with_right_sums
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.inputs import read_camera_path
-from stereovox.evaluate.trajectory.trajectory import read_relations
+from stereovox.evaluate.trajectory import read_relations
 from stereovox.files.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.products.projection import LiveProjection
 
 LATER_KERNELS = """
 import json

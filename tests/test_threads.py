@@ -28,9 +28,12 @@ from stereovox.maps.record.history import WithHistory
 from stereovox.maps.storage import cubes
 from stereovox.maps.storage.storage import OnStorage, Storage
 from stereovox.maps.voxel_map import OnBlocks
-from stereovox.products import coarsen, crop, difference, frontiers, merge, moved, path_check
-from stereovox.products.floor import ground, projection, slices
-from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.products import difference, frontiers, ground, moved, path_check, projection
+from stereovox.products import edit as coarsen
+from stereovox.products import edit as crop
+from stereovox.products import edit as merge
+from stereovox.products import floor_axes as slices
+from stereovox.products.projection import LiveProjection
 
 NO_EVIDENCE = Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.empty((0, 3), np.int32), 0)
 NO_SCAN = GridEvidence(np.empty((0, 3), np.int32), np.empty((0, 4096), np.int16))

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from stereovox.depth.cloud import deskewed as deskewed
     from stereovox.descriptions import describe as describe
     from stereovox.errors import StereovoxError as StereovoxError
-    from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore as TrajectoryScore
-    from stereovox.evaluate.trajectory.trajectory_score import score_trajectory as score_trajectory
+    from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
+    from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
     from stereovox.fleet import FleetMap as FleetMap
     from stereovox.fleet import FleetPlan as FleetPlan
     from stereovox.fleet import FleetScores as FleetScores
@@ -75,14 +75,14 @@ if TYPE_CHECKING:
     from stereovox.mavlink.sending import ObstacleSender as ObstacleSender
     from stereovox.opening import open_images as open_images
     from stereovox.opening import open_source as open_source
-    from stereovox.products.coarsen import coarsen as coarsen
-    from stereovox.products.crop import crop as crop
     from stereovox.products.difference import difference as difference
     from stereovox.products.distance import DistanceField as DistanceField
-    from stereovox.products.floor.ground import ground as ground
-    from stereovox.products.floor.level_ways import LevelPlanner as LevelPlanner
-    from stereovox.products.floor.level_ways import Waypoints as Waypoints
+    from stereovox.products.edit import coarsen as coarsen
+    from stereovox.products.edit import crop as crop
     from stereovox.products.frontiers import frontiers as frontiers
+    from stereovox.products.ground import ground as ground
+    from stereovox.products.level_ways import LevelPlanner as LevelPlanner
+    from stereovox.products.level_ways import Waypoints as Waypoints
     from stereovox.products.path_check import check_path as check_path
     from stereovox.ros.nav2 import write_nav2 as write_nav2
     from stereovox.runs.floor import FloorRun as FloorRun
@@ -137,19 +137,19 @@ _HOMES = {
     "describe": "descriptions",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
-    "TrajectoryScore": "evaluate.trajectory.trajectory_score",
-    "score_trajectory": "evaluate.trajectory.trajectory_score",
+    "TrajectoryScore": "evaluate.trajectory_score",
+    "score_trajectory": "evaluate.trajectory_score",
     "export": "formats",
     "import_map": "formats",
     "DistanceField": "products.distance",
-    "LevelPlanner": "products.floor.level_ways",
-    "Waypoints": "products.floor.level_ways",
+    "LevelPlanner": "products.level_ways",
+    "Waypoints": "products.level_ways",
     "check_path": "products.path_check",
-    "coarsen": "products.coarsen",
-    "crop": "products.crop",
+    "coarsen": "products.edit",
+    "crop": "products.edit",
     "difference": "products.difference",
     "frontiers": "products.frontiers",
-    "ground": "products.floor.ground",
+    "ground": "products.ground",
     "Joined": "correct.merge_maps",
     "join": "correct.merge_maps",
     "merge": "correct.merge_maps",

@@ -20,7 +20,7 @@ from stereovox.calibrate.stereo import (
 from stereovox.calibrate.stereo_fit import fit_stereo
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import inverse, rotation_vector, transform_points
-from stereovox.view.report.stereo import write_stereo_report
+from stereovox.view.report.calibration import write_stereo_report
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/chessboard_stereo"
 

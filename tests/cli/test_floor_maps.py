@@ -9,7 +9,7 @@ from made_floors import FREE, WALL, changed, looked_up, room
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid

@@ -13,7 +13,7 @@ from stereovox.correct.close_loops import close
 from stereovox.correct.loops.closer import Loop, LoopCloser
 from stereovox.correct.loops.matching import Match
 from stereovox.correct.loops.positions import Positions
-from stereovox.maps.record.loop_lines import LoopLines
+from stereovox.maps.record.camera_path import LoopLines
 from stereovox.products.moved import moved
 from stereovox.sources.poses.trajectory import Trajectory, write_trajectory
 

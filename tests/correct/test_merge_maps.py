@@ -15,7 +15,7 @@ from stereovox.correct.loops.closer import check_one_way
 from stereovox.correct.merge_maps import _follow, why_added
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.products.merge import merge as added
+from stereovox.products.edit import merge as added
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/sevenscenes_redkitchen"
 SETTINGS = {

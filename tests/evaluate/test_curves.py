@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.evaluate.curves import roc
-from stereovox.evaluate.distance import round_edges
-from stereovox.evaluate.reliability import brier, correlation, reliability
+from stereovox.evaluate.curves import brier, correlation, reliability, roc, round_edges
 from stereovox.evaluate.scores import score
 
 

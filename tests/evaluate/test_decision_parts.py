@@ -13,13 +13,10 @@ from hypothesis import strategies as st
 from made_scores import neighbours
 
 import stereovox as sv
-from stereovox.evaluate.cells import indices, keys
-from stereovox.evaluate.decision_parts import decision_parts
-from stereovox.evaluate.decisions import decide
-from stereovox.evaluate.looks import looks, views
+from stereovox.evaluate.decisions import decide, decision_parts, looks, views
 from stereovox.evaluate.scores import score
-from stereovox.evaluate.thickness import Thickness, thickness
-from stereovox.evaluate.truth_cells import Neighbourhood, TruthCells
+from stereovox.evaluate.truth import indices, keys
+from stereovox.evaluate.truth_cells import Neighbourhood, Thickness, TruthCells, thickness
 from stereovox.geometry.se3 import look_at
 
 SIZE = 0.5

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stereovox as sv
-from stereovox.evaluate.cells import indices
 from stereovox.evaluate.decisions import decide, decisions
+from stereovox.evaluate.truth import indices
 from stereovox.evaluate.truth_cells import TruthCells
 
 LEVELS = {"free": -2.0, "tentative": 0.2, "occupied": 2.0}

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_floors import FREE, WALL, changed, looked_up, room
 
-from stereovox.evaluate.grids.grid_align import Fit, align_grids
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_align import Fit, align_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.geometry import se2
 from stereovox.maps.occupancy import OccupancyGrid
 

@@ -9,8 +9,8 @@ import pytest
 from made_floors import FREE, WALL, changed, random_floor, room
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import aligned_grids
-from stereovox.evaluate.grids.grid_scores import Difference, differences, score_grids, wrong
+from stereovox.evaluate.grid_align import aligned_grids
+from stereovox.evaluate.grid_scores import Difference, differences, score_grids, wrong
 from stereovox.geometry import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid

@@ -3,9 +3,8 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.evaluate.cells import keys
 from stereovox.evaluate.metrics import Confusion, by_part, compare, compare_map, find_piece, find_pieces, longest_gap
-from stereovox.evaluate.truth import Piece, Truth
+from stereovox.evaluate.truth import Piece, Truth, keys
 from stereovox.maps import VoxelMap
 
 ROW = [[x, 0, 0] for x in range(10)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.evaluate.trajectory.trajectory import read_relations, relation_errors, score_relations
+from stereovox.evaluate.trajectory import read_relations, relation_errors, score_relations
 from stereovox.geometry import se2
 from stereovox.localize.track import Track
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import indices, keys
-from stereovox.evaluate.outcomes import Outcome, outcomes
+from stereovox.evaluate.decisions import Outcome, outcomes
 from stereovox.evaluate.scores import score
+from stereovox.evaluate.truth import indices, keys
 from stereovox.evaluate.truth_cells import CellReader, Neighbourhood, TruthCells
 from stereovox.frame import Viewpoint
 from stereovox.maps import make_map

@@ -2,7 +2,7 @@
 """What a summary of a run says of its times."""
 
 import stereovox as sv
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.metrics import summarise
 from stereovox.frame import UpdateReport
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory.trajectory import best_motion, trajectory_error
+from stereovox.evaluate.trajectory import best_motion, trajectory_error
 from stereovox.geometry import se2
 from stereovox.localize.track import Track
 from stereovox.sources.poses.poses import Poses

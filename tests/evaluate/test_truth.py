@@ -3,9 +3,17 @@ import numpy as np
 import pytest
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.evaluate.cells import indices, keys, position, within
-from stereovox.evaluate.sightings import Sightings
-from stereovox.evaluate.truth import exact_occupancy, interior_cells, longest_axis, touched_cells
+from stereovox.evaluate.truth import (
+    exact_occupancy,
+    indices,
+    interior_cells,
+    keys,
+    longest_axis,
+    position,
+    touched_cells,
+    within,
+)
+from stereovox.evaluate.truth_cells import Sightings
 from stereovox.geometry.se3 import look_at
 from stereovox.simulate.scene import Scene, box, cylinder
 

@@ -23,8 +23,7 @@ from stereovox.files.safe_io import (
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.calibration.camera_file import read_camera
 from stereovox.sources.poses.tracker import read_tracker
-from stereovox.view.report.folder import out_folder
-from stereovox.view.report.page import write_page
+from stereovox.view.report.page import out_folder, write_page
 
 LEVELS = 40
 REPEATED = "a0: &a0 [1, 2]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, LEVELS))

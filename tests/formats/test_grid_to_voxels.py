@@ -11,7 +11,7 @@ from stereovox.formats.grid_to_voxels import raised
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 
 
 def floor(origin=(-1.0, 2.0, 0.0)):

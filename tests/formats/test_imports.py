@@ -14,7 +14,7 @@ from stereovox.formats import export, import_map
 from stereovox.formats.bags import read_bag_grid, write_grid_bag
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.sources._lzf import unpack
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.robot_messages import read_transforms

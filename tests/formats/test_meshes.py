@@ -12,7 +12,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats import export
 from stereovox.formats.meshes import cube_faces, surface
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.floor_axes import upright_axes
+from stereovox.products.floor_axes import upright_axes
 
 SURFACES = (".obj", ".stl")
 

@@ -258,7 +258,7 @@ def test_a_map_outgrows_its_room(monkeypatch):
 
 
 def test_how_far_a_frame_agrees_with_the_map_is_as_on_the_processor(monkeypatch):
-    monkeypatch.setattr("stereovox.maps.record.frame_agreement.SAMPLE", 3)  # so that blocks are left out
+    monkeypatch.setattr("stereovox.maps.record.glance.SAMPLE", 3)  # so that blocks are left out
     maps = [grown(device, (0, 2))[0] for device in ("cuda", "cpu")]
     mine, its = (one.storage.agreement(evidence_of(2), 100) for one in maps)
     assert mine == its

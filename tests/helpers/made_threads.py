@@ -14,8 +14,7 @@ from stereovox.geometry import se2
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import load_grid
 from stereovox.products.distance import DistanceField
-from stereovox.products.floor.live_projection import LiveProjection
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import LiveProjection, project
 
 SENSORS = 4
 CAMERA = sv.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)

@@ -29,7 +29,7 @@ from stereovox.live.stream import LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import State, load_map
 from stereovox.opening import open_source
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.base import Stream

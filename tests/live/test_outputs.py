@@ -24,7 +24,7 @@ from stereovox.live.recorder import WAITING, Recorder, optical, topic
 from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
-from stereovox.products.floor import live_projection
+from stereovox.products import projection as live_projection
 from stereovox.simulate.simulation import Simulation
 from stereovox.sources.bags.writer import BagWriter
 

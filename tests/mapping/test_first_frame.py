@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.metrics import summarise
 from stereovox.mapping import comparison
 from stereovox.maps.record.history import TRIES
 from stereovox_lab.checks.lasting import FAULTS, Bad, Walk, _always

@@ -19,7 +19,7 @@ from stereovox.maps import State, grid_map
 from stereovox.maps.cells.evidence import GridEvidence
 from stereovox.maps.grid_map import DEEP_CELLS, GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.maps.record.frame_agreement import AGAINST_BEAMS, FEW_BEAMS, BeamAgreement
+from stereovox.maps.record.glance import AGAINST_BEAMS, FEW_BEAMS, BeamAgreement
 from stereovox.opening import open_robot
 from stereovox.simulate.floors.plan import block
 from stereovox.simulate.floors.view import cast

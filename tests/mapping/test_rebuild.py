@@ -17,8 +17,7 @@ from stereovox.geometry.se3 import rotation_matrix
 from stereovox.mapping.rebuild import Rebuild
 from stereovox.maps.record.kept_frames import KeptFrames
 from stereovox.products.distance import DistanceField
-from stereovox.products.floor.live_projection import LiveProjection
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import LiveProjection, project
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/sevenscenes_redkitchen"
 TRUSTING = {"trust.max_disagreement": 1, "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9, "trust.frozen": False}

@@ -18,7 +18,7 @@ from stereovox.maps.cells.cell_format import State
 from stereovox.maps.files import boxed_manifest
 from stereovox.maps.files.boxed_manifest import only_writer_at, read_boxed_manifest
 from stereovox.maps.storage.boxes import read_box
-from stereovox.products.coarsen import coarsen
+from stereovox.products.edit import coarsen
 
 BOX_M = 1.6
 STOPS = [(State.OCCUPIED,), (State.OCCUPIED, State.TENTATIVE), (State.UNKNOWN, State.OCCUPIED), (State.UNKNOWN,)]

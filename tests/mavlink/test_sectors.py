@@ -73,7 +73,7 @@ def test_height_band_is_level_whatever_roll_and_pitch():
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
 def test_any_axis_may_point_up(up):
     """Right of a body that looks along the floor's x is minus its y, wherever up is."""
-    from stereovox.products.floor.floor_axes import upright_axes
+    from stereovox.products.floor_axes import upright_axes
 
     x, y, upwards = upright_axes(up)
     post = np.sort(np.stack([2 * x - 1.5 * y - 0.1, 2 * x - 1.5 * y + 0.1]), axis=0)

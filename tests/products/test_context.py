@@ -23,9 +23,9 @@ from stereovox.maps.record import health
 from stereovox.mavlink import directions, sectors
 from stereovox.mavlink.body import Body
 from stereovox.mavlink.link import dialect
+from stereovox.products import projection
 from stereovox.products.context import OUTPUTS, context_of
-from stereovox.products.floor import projection
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.sources.poses.live_poses import LivePoses
 
 S = 1_000_000_000

@@ -7,8 +7,7 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
-from stereovox.products.distance import DistanceField
-from stereovox.products.transform import Transform, transformed
+from stereovox.products.distance import DistanceField, Transform, transformed
 
 RANDOM = np.random.default_rng(8)
 SHAPES = [((21, 37, 9), (1.0, 1.0, 1.0)), ((5, 40, 34), (0.05, 0.07, 0.2)), ((1, 30, 50), (0.1, 0.1, 0.1))]

@@ -9,8 +9,8 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor.floor_heights import REACH, FloorHeights, find_floor
-from stereovox.products.floor.projection import project
+from stereovox.products.floor_heights import REACH, FloorHeights, find_floor
+from stereovox.products.projection import project
 
 SIDE = 0.1
 FREE, WALL = -3.0, 3.0

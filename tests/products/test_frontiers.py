@@ -8,8 +8,8 @@ import pytest
 from made_maps import KINDS, random_map, states
 
 from stereovox import State, StereovoxError, VoxelMap, frontiers, load_config
+from stereovox.products.blocks import CORNERS, FACES, components
 from stereovox.products.frontiers import write_frontiers
-from stereovox.products.neighbours import CORNERS, FACES, components
 
 FREE, WALL = -3.0, 3.0
 

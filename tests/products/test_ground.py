@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox import State, StereovoxError, VoxelMap, ground, load_config
-from stereovox.products.floor.ground import Footing, Robot, beside, slopes, write_ground
+from stereovox.products.ground import Footing, Robot, beside, slopes, write_ground
 
 SIDE = 0.05
 HIGH = 30

@@ -8,7 +8,7 @@ from stereovox.errors import StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.projection import inflated, inflated_grid, inflated_mask
+from stereovox.products.projection import inflated, inflated_grid, inflated_mask
 
 RANDOM = np.random.default_rng(3)
 

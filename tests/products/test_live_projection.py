@@ -14,8 +14,7 @@ from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.maps.storage.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
-from stereovox.products.floor.live_projection import STEP, LiveProjection
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import STEP, LiveProjection, project
 from stereovox.simulate.simulation import Simulation
 
 CAMERA = PinholeCamera.from_field_of_view(24, 18, 80.0)

@@ -9,14 +9,14 @@ import pytest
 from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.formats import export
 from stereovox.formats.map_server import read_map_server
 from stereovox.mapper import Mapper
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.maps.storage.storage import Storage
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.simulate.floors.floor import Floor
 
 SIZE = 0.1

@@ -5,7 +5,7 @@ import pytest
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor.slices import along_ray, layer
+from stereovox.products.floor_axes import along_ray, layer
 
 CELLS = {(0, 0, 0): 2.0, (3, 0, 1): -1.5, (-2, 4, 1): 0.3, (1, 2, 1): 2.5}
 

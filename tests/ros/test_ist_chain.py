@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from std_msgs.msg import Float32  # noqa: E402
 
-from stereovox.evaluate.grids.grid_scores import score_grids  # noqa: E402
+from stereovox.evaluate.grid_scores import score_grids  # noqa: E402
 from stereovox.formats.map_server import read_map_server  # noqa: E402
 from stereovox.ros.poses.tf_message import tf_message  # noqa: E402
 from stereovox.runs.floor import map_floor  # noqa: E402

@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereo
 
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
 from stereovox.ros.poses import location_topics as topics

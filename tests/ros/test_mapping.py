@@ -13,7 +13,7 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.formats.map_server import write_map_server
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options
 from stereovox.ros.score import score_of

@@ -26,7 +26,7 @@ from stereovox.config import load_config  # noqa: E402
 from stereovox.errors import StereovoxError  # noqa: E402
 from stereovox.geometry.se3 import from_quaternion, inverse  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
-from stereovox.products.floor.projection import project  # noqa: E402
+from stereovox.products.projection import project  # noqa: E402
 from stereovox.ros.library import optional_message  # noqa: E402
 from stereovox.ros.mapping import Mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402

@@ -14,10 +14,9 @@ from stereovox.cli.look.view import _recording
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_source
-from stereovox.products.block_pairs import check_alike
-from stereovox.products.floor.live_projection import LiveProjection
-from stereovox.products.floor.projection import project
+from stereovox.products.blocks import check_alike
 from stereovox.products.moved import level_transform, levelled, moved
+from stereovox.products.projection import LiveProjection, project
 
 TILT = rotation_matrix([0.4, 0.15, 0.0]) @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The made room, whose z is up, in a world whose -y is nearly up."""

@@ -20,7 +20,7 @@ from made_robot_bags import START_NS, Messages, RobotBagMaker
 from stereovox.calibrate.chessboard import read_grey
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.evaluate.inputs import read_camera_path
-from stereovox.evaluate.trajectory.trajectory import read_relations
+from stereovox.evaluate.trajectory import read_relations
 from stereovox.opening import open_source
 from stereovox.sources.bags import unpack
 from stereovox.sources.bags.db3 import Db3File

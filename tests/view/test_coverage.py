@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox.view.coverage import coverage_figure
+from stereovox.view.evaluation import coverage_figure
 
 
 def flight(scene, coverage, collided=None):

@@ -8,10 +8,8 @@ from matplotlib.image import imread
 
 from stereovox.config import load_config
 from stereovox.maps import State, VoxelMap
-from stereovox.view.figures import save
-from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS
-from stereovox.view.scene.dark import COLOURS, PAGE, darken
-from stereovox.view.scene.views import VIEWS, draw_view
+from stereovox.view.figures import COLOURS, PAGE, PATH_COLOUR, STATE_COLOURS, darken, save
+from stereovox.view.views import VIEWS, draw_view
 
 
 def made_map():

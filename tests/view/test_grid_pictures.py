@@ -12,13 +12,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import aligned_grids
-from stereovox.evaluate.grids.grid_scores import Difference, differences, laid_on, score_laid, wrong
+from stereovox.evaluate.grid_align import aligned_grids
+from stereovox.evaluate.grid_scores import Difference, differences, laid_on, score_laid, wrong
 from stereovox.geometry import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.view.grid import draw_grid, picture_grid, pooled, trimmed
-from stereovox.view.grid_difference import (
+from stereovox.view.figures import PATH_COLOUR, STATE_COLOURS
+from stereovox.view.grid import (
     BOTH_FREE,
     BOTH_OCCUPIED,
     BOTH_UNKNOWN,
@@ -26,9 +26,12 @@ from stereovox.view.grid_difference import (
     binary_png,
     classes,
     difference_png,
+    draw_grid,
+    picture_grid,
+    pooled,
     side_by_side_png,
+    trimmed,
 )
-from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS
 from stereovox.view.report.grid import write_grid_report
 
 

@@ -8,11 +8,11 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.record.camera_path import StampedPose
-from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS, round_length
+from stereovox.view.drawn import camera_path, ceiling, upright
+from stereovox.view.figures import PATH_COLOUR, STATE_COLOURS, round_length
 from stereovox.view.picture import picture
-from stereovox.view.scene.drawn import camera_path, ceiling, upright
-from stereovox.view.scene.render import LIGHT, Direction, render
-from stereovox.view.scene.views import draw_view
+from stereovox.view.render import LIGHT, Direction, render
+from stereovox.view.views import draw_view
 
 CONFIG = load_config("default", voxel_size=0.1)
 RED, GREEN = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])

@@ -7,7 +7,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap
-from stereovox.view.scene.plain import FROM, colour_depth, plan_pixels, space_pixels
+from stereovox.view.plain import FROM, colour_depth, plan_pixels, space_pixels
 
 OCCUPIED, FREE, UNKNOWN = (34, 48, 74), (251, 250, 245), (201, 206, 214)
 

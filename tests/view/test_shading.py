@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from stereovox.view.scene.shading import BURIED, Occlusion
+from stereovox.view.render import BURIED, Occlusion
 
 RADII = ((1, 0.3), (3, 0.9))
 

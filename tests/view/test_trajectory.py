@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory.trajectory_motions import travelled_m
+from stereovox.evaluate.trajectory_score import travelled_m
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.view.figures import png_of

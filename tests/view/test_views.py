@@ -10,17 +10,12 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.geometry.se3 import rigidity_error
 from stereovox.maps import VoxelMap, load_map
-from stereovox.view.figures import save
-from stereovox.view.panels import PATH_COLOUR
-from stereovox.view.scene.drawn import UPS, upright
-from stereovox.view.scene.landscape import FROM, columns, thinned
-from stereovox.view.scene.layer import upright_layer
-from stereovox.view.scene.render import render
-from stereovox.view.scene.scale import scale_of
-from stereovox.view.scene.shading import Occlusion
-from stereovox.view.scene.space import numbers
-from stereovox.view.scene.viewpoint import field_of_view, viewpoint_at
-from stereovox.view.scene.views import VIEWS, draw_view
+from stereovox.view.drawn import UPS, field_of_view, upright, viewpoint_at
+from stereovox.view.figures import PATH_COLOUR, save
+from stereovox.view.layer import FROM, columns, scale_of, thinned, upright_layer
+from stereovox.view.render import Occlusion, render
+from stereovox.view.space import numbers
+from stereovox.view.views import VIEWS, draw_view
 
 CAMERA = PinholeCamera.from_field_of_view(100, 60, 90, 0.05)
 

@@ -13,8 +13,8 @@ from stereovox import PinholeCamera, VoxelMap, load_config
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State
-from stereovox.maps.record.loop_lines import LoopLines
-from stereovox.view.scene.scale import scale_of
+from stereovox.maps.record.camera_path import LoopLines
+from stereovox.view.layer import scale_of
 from stereovox.viewer.cameras import first_look, up_vector
 from stereovox.viewer.cells import CORNERS, FACES, brightness, linear
 from stereovox.viewer.layer import MAX_PX, layer_colours, sharp

@@ -46,7 +46,7 @@ def print_trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
     """Print and return the error of the trajectory; empty if the true one is unknown."""
     if robot.truth is None:
         return {}
-    from stereovox.evaluate.trajectory import trajectory
+    from stereovox.evaluate import trajectory
 
     error = trajectory.trajectory_error(track, robot.truth)
     off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"

@@ -26,8 +26,8 @@ from stereovox.mapper import Mapper
 from stereovox.mapping.rebuild import CorrectionReport, need_frames
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.files.store import check_target
-from stereovox.maps.record.loop_lines import LoopLines
-from stereovox.products.floor.floor_axes import up_of
+from stereovox.maps.record.camera_path import LoopLines
+from stereovox.products.floor_axes import up_of
 from stereovox.sources.bags import suffix_of
 from stereovox.sources.bags.fixes import read_fixes
 from stereovox.sources.bags.recording import file_part

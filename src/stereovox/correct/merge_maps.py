@@ -21,12 +21,12 @@ from stereovox.kernels.threads import one_state
 from stereovox.mapping.deadline import Levels
 from stereovox.mapping.rebuild import Rebuild, as_corrected, need_frames
 from stereovox.maps import VoxelMap
+from stereovox.maps.record.camera_path import LoopLines
 from stereovox.maps.record.kept_frames import KeptFrame, KeptFrames
-from stereovox.maps.record.loop_lines import LoopLines
 from stereovox.maps.storage.storage import settings_of_frames
-from stereovox.products.block_pairs import check_alike
-from stereovox.products.merge import merge as added
-from stereovox.products.merge import together
+from stereovox.products.blocks import check_alike
+from stereovox.products.edit import merge as added
+from stereovox.products.edit import together
 from stereovox.products.moved import rigid
 
 OF_WORLD = {"up", "levelled_from"}
@@ -121,7 +121,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     If both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
     order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame in
     both, as from overlapping parts of a recording, counts once, with its pose in `a`. Otherwise (`why_added` gives the
-    reason) their evidence adds up: see `products.merge`. Cells that had reached their limits may then differ from those
+    reason) their evidence adds up: see `products.edit.merge`. Cells that had reached their limits may then differ from those
     of one run.
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, SourceError
-from stereovox.evaluate.distance import distances
+from stereovox.evaluate.curves import distances
 from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.files.safe_io import MAX_LIST, read_text
 from stereovox.maps import VoxelMap, load_map

@@ -15,7 +15,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.depth.quality import check_unit_of_rays
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.evaluate.cells import indices, keys
+from stereovox.evaluate.truth import indices, keys
 from stereovox.frame import Cloud, Viewpoint
 from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.integrate.crossing import crossed_cells

@@ -9,13 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.evaluate.curves import THRESHOLDS, PrecisionRecall, Roc, precision_recall, roc
-from stereovox.evaluate.decision_parts import Part, decision_parts
-from stereovox.evaluate.decisions import Decisions, decide
-from stereovox.evaluate.distance import ByDistance, by_distance
-from stereovox.evaluate.looks import looks
+from stereovox.evaluate.curves import (
+    BINS,
+    LIKELY,
+    THRESHOLDS,
+    ByDistance,
+    PrecisionRecall,
+    Reliability,
+    Roc,
+    brier,
+    by_distance,
+    correlation,
+    equal_mass,
+    precision_recall,
+    reliability,
+    roc,
+)
+from stereovox.evaluate.decisions import Decisions, Part, decide, decision_parts, looks
 from stereovox.evaluate.metrics import Confusion, ratio
-from stereovox.evaluate.reliability import BINS, LIKELY, Reliability, brier, correlation, equal_mass, reliability
 from stereovox.evaluate.truth_cells import Reading, TruthCells, level
 from stereovox.maps import VoxelMap
 

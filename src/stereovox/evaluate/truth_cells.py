@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Truth map prepared for scoring other maps."""
+"""Truth map prepared for scoring other maps.
+
+Thickness of the surface in a cell: line, sheet or bulk, by the surface cells around it. Count the frames that saw each
+cell of the truth.
+"""
 
 from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from math import log
 from typing import Any
@@ -12,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, indices, keys, position
 from stereovox.evaluate.metrics import known_cells
+from stereovox.evaluate.truth import Keys, indices, keys, position
+from stereovox.geometry.se3 import Transform
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.storage.cubes import in_cubes
 
@@ -240,3 +247,67 @@ def level(threshold: float) -> float:
             f"threshold {threshold} is not a probability between 0 and 1; leave it out for the map's own"
         )
     return log(threshold / (1 - threshold)) + _ROUNDING
+
+
+WINDOW = 2
+"""Cells inspected to each side."""
+THIN = 2.5
+"""Extent in cells below which a shape counts as one or two cells thick."""
+
+
+class Thickness(IntEnum):
+    """Shape of the surface cells around a cell.
+
+    LINE: one or two cells across in two directions, like poles, wires, table legs and lone cells. SHEET: in one
+    direction, like walls and floors, with their edges and corners. BULK: in none, where surfaces meet.
+    """
+
+    LINE = 0
+    SHEET = 1
+    BULK = 2
+
+
+def thickness(surface: Neighbourhood) -> NDArray[np.uint8]:
+    """Return the `Thickness` (S,) uint8 of each surface cell.
+
+    It uses the surface cells in the cube of 5 cells a side around it, in any orientation: a row of w cells has
+    the variance (w^2 - 1) / 12, so that sqrt(12 v + 1) is the extent in cells along a principal axis of variance v.
+    """
+    variances = np.linalg.eigvalsh(surface.spread(WINDOW))  # (S, 3), ascending
+    extents = np.sqrt(12 * np.maximum(variances, 0) + 1)
+    return (extents >= THIN)[:, :2].sum(axis=1).astype(np.uint8)
+
+
+class Sightings:
+    """Counts the frames in which each cell of a set was seen.
+
+    cells: the set, ascending keys (N,). frames: (N,) int32, number of frames that saw each.
+    """
+
+    def __init__(self, cells: Keys, voxel_size: float):
+        self.cells, self.voxel_size = cells, voxel_size
+        self.frames = np.zeros(len(cells), np.int32)
+
+    def add(
+        self, depth_m: NDArray[np.floating], camera: PinholeCamera, T_world_camera: Transform, max_range: float = np.inf
+    ) -> None:
+        """Count one frame: a cell is seen if a pixel of exact depth (height, width) up to `max_range` is in it.
+
+        Depth is in metres along the optical axis; pixels with inf, NaN or values not above 0 do not count.
+        """
+        x, y = camera.ray_slopes()
+        depth = np.asarray(depth_m, float)
+        with np.errstate(invalid="ignore"):
+            depth = np.where((depth > 0) & (depth <= max_range), depth, np.nan)
+        R, origin = T_world_camera[:3, :3] / self.voxel_size, T_world_camera[:3, 3] / self.voxel_size
+        hit = np.isfinite(depth)
+        landed = [
+            np.floor((depth * (R[axis, 0] * x[None, :] + R[axis, 1] * y[:, None] + R[axis, 2]) + origin[axis])[hit])
+            for axis in range(3)
+        ]
+        seen = keys(np.stack(landed, axis=1))
+        seen = seen[np.diff(seen, prepend=-1) != 0]  # neighbours mostly share a cell: look up each once
+        place = position(seen, self.cells)
+        mask = np.zeros(len(self.cells), bool)
+        mask[place[place >= 0]] = True
+        self.frames += mask

@@ -14,7 +14,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
-from stereovox.evaluate.summary import mostly_lost
+from stereovox.evaluate.metrics import mostly_lost
 from stereovox.files.places import Place
 from stereovox.files.safe_io import sealed, unsealed
 from stereovox.fleet.boxes import DONE, Box, BoxesBefore, DoneBox, boxes_of, map_box
@@ -47,7 +47,7 @@ from stereovox.maps.files.store import MANIFEST, viewpoint_from
 from stereovox.maps.record.history import History
 from stereovox.maps.storage.boxes import MAX_SIDE, BoxEntry, BoxLayout
 from stereovox.opening import open_source
-from stereovox.products.merge import together
+from stereovox.products.edit import together
 from stereovox.runs.engine import SURVEYED, ended_in_order
 from stereovox.runs.survey import PICTURES_UPRIGHT, survey
 

@@ -16,7 +16,7 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.files.store import is_map
 from stereovox.maps.record.history import Imported
 from stereovox.maps.storage.cubes import in_cubes
-from stereovox.products.floor.floor_heights import FloorHeights
+from stereovox.products.floor_heights import FloorHeights
 
 CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".ptx", ".bin", ".stl", ".obj",
           ".off")  # fmt: skip

@@ -17,9 +17,9 @@ from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_o
 from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.floor_axes import upright_axes
-from stereovox.products.floor.floor_heights import FloorHeights, floor_of_map
-from stereovox.products.floor.projection import Heights, project
+from stereovox.products.floor_axes import upright_axes
+from stereovox.products.floor_heights import FloorHeights, floor_of_map
+from stereovox.products.projection import Heights, project
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import (

@@ -18,7 +18,7 @@ from stereovox.geometry import se2
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.record.history import Imported
-from stereovox.products.floor.floor_axes import checked_heights
+from stereovox.products.floor_axes import checked_heights
 
 WITHIN = (1 / 6, 1 / 2, 5 / 6)
 """Points in a cell, as shares of its side, that are looked up in the floor's map."""

@@ -17,9 +17,9 @@ from stereovox.files.safe_io import MAX_YAML, read_bounded, replacing, shown, ya
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
-from stereovox.products.floor.floor_axes import Heights
-from stereovox.products.floor.floor_heights import FloorHeights
-from stereovox.products.floor.projection import inflated_grid, project
+from stereovox.products.floor_axes import Heights
+from stereovox.products.floor_heights import FloorHeights
+from stereovox.products.projection import inflated_grid, project
 
 MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")

@@ -22,8 +22,8 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.storage.blocks import SIDE
-from stereovox.products.block_pairs import cells_at, in_memory
-from stereovox.products.floor.floor_axes import upright_axes
+from stereovox.products.blocks import cells_at, in_memory
+from stereovox.products.floor_axes import upright_axes
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -14,7 +14,7 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.occupancy import Percent
-from stereovox.products.floor.floor_axes import heights_of
+from stereovox.products.floor_axes import heights_of
 
 PLY_POINT = np.dtype(
     [

@@ -20,7 +20,7 @@ from stereovox.mavlink.pose_sender import PoseMessage, PoseSender
 from stereovox.mavlink.sectors import SectorRules
 from stereovox.mavlink.sending import ObstacleSender
 from stereovox.mavlink.stream import MavlinkPoses
-from stereovox.products.floor.floor_axes import up_of
+from stereovox.products.floor_axes import up_of
 from stereovox.sources.poses.live_poses import LivePoses, NewestPose
 from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
 from stereovox.track.tracker import POSE_FAULTS

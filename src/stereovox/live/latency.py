@@ -8,7 +8,7 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
-from stereovox.evaluate.summary import percentiles
+from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import UpdateReport
 from stereovox.frame.wall_clock import epoch_ns
 from stereovox.live.stream import Moment

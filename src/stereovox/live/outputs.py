@@ -26,8 +26,8 @@ from stereovox.geometry.se3 import Transform, inverse
 from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.context import context_of
-from stereovox.products.floor.floor_axes import Heights
-from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.products.floor_axes import Heights
+from stereovox.products.projection import LiveProjection
 from stereovox.sources.poses.live_poses import LivePoses
 
 GRID_S = 1.0

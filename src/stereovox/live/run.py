@@ -19,7 +19,7 @@ from stereovox.live.rig import LiveCamera, read_live
 from stereovox.live.stream import WAIT_S, LiveStream
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.floor_axes import Heights
+from stereovox.products.floor_axes import Heights
 from stereovox.runs.engine import MapOptions, Observer, Run, RunResult, takes
 from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.runs.recording import MapRun

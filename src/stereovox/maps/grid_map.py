@@ -24,11 +24,11 @@ from stereovox.maps.cells.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvide
 from stereovox.maps.files.lock import only_writer_of
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.query.queries import INDEX_LIMIT, points_of, shape_error
-from stereovox.maps.record.frame_agreement import BeamAgreement
+from stereovox.maps.record.glance import BeamAgreement
 from stereovox.maps.record.history import History
 from stereovox.maps.storage.blocks import BlockPool
-from stereovox.maps.storage.memory import format_bytes
 from stereovox.maps.storage.storage import OnStorage
+from stereovox.maps.storage.window import format_bytes
 
 FORMAT, VERSION = "stereovox-grid", 2
 PARTS = ("about", "coords", "cells")

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.maps.cells.cell_format import State
 from stereovox.maps.record.history import History
 from stereovox.maps.storage.blocks import SIDE
-from stereovox.maps.storage.memory import format_bytes
+from stereovox.maps.storage.window import format_bytes
 from stereovox.maps.upright import ceiling, turned, turned_cells
 
 SIZE_PX = 400

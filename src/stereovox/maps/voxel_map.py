@@ -14,7 +14,7 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.kernels.threads import Guarded
 from stereovox.maps.cells.cell_format import State as State
-from stereovox.maps.cells.cell_times import NEVER
+from stereovox.maps.cells.cell_pool import NEVER
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.files.store import save_map
 from stereovox.maps.query import queries

@@ -30,7 +30,7 @@ from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, rigidity_error
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.voxel_map import leaning
-from stereovox.products.floor.floor_axes import up_of, upright_axes
+from stereovox.products.floor_axes import up_of, upright_axes
 
 SECTORS = 72
 INCREMENT_DEG = 360 / SECTORS

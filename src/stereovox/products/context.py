@@ -15,8 +15,8 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.maps.record.health import UNFIT, Health
-from stereovox.products.floor.floor_axes import up_of
-from stereovox.products.floor.floor_heights import FloorHeights
+from stereovox.products.floor_axes import up_of
+from stereovox.products.floor_heights import FloorHeights
 
 
 class HasMap(Protocol):

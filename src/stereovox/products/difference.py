@@ -14,7 +14,7 @@ from stereovox.kernels.threads import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.block_pairs import block_pairs, check_alike, in_memory
+from stereovox.products.blocks import block_pairs, check_alike, in_memory
 from stereovox.products.moved import moved
 
 

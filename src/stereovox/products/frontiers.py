@@ -19,10 +19,9 @@ from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.query.queries import points_of
 from stereovox.maps.storage.blocks import CELLS
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.block_pairs import in_memory
-from stereovox.products.floor.floor_axes import Heights, checked_band, heights_of
-from stereovox.products.floor.floor_heights import known_floor
-from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
+from stereovox.products.blocks import CORNERS, FACES, components, in_memory, shifted, with_margins
+from stereovox.products.floor_axes import Heights, checked_band, heights_of
+from stereovox.products.floor_heights import known_floor
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

@@ -19,8 +19,8 @@ from stereovox.maps.record.camera_path import CameraPath, StampedPose
 from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved as _kernels
-from stereovox.products.block_pairs import cells_at, in_memory, set_times
-from stereovox.products.floor.floor_axes import nearest_axis, upright_axes
+from stereovox.products.blocks import cells_at, in_memory, set_times
+from stereovox.products.floor_axes import nearest_axis, upright_axes
 
 PIECE = 512
 """Blocks processed together."""

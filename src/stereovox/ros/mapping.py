@@ -22,8 +22,8 @@ from stereovox.maps.record.health import Health
 from stereovox.maps.record.history import History
 from stereovox.maps.record.kept_frames import KeptFrame
 from stereovox.maps.storage.storage import EVERYWHERE
-from stereovox.products.floor.floor_axes import Heights
-from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.products.floor_axes import Heights
+from stereovox.products.projection import LiveProjection
 from stereovox.ros.background import Background
 
 PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]

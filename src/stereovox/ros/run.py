@@ -13,7 +13,7 @@ from typing import Any
 
 from stereovox.config import Config
 from stereovox.errors import MapFileError
-from stereovox.evaluate.summary import mostly_lost, percentiles
+from stereovox.evaluate.metrics import mostly_lost, percentiles
 from stereovox.files.safe_io import FLOOR_ENDINGS, check_file, check_in_space
 from stereovox.formats.map_server import write_map_server
 from stereovox.frame import UpdateReport

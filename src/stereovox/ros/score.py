@@ -9,8 +9,8 @@ from time import monotonic
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import Rectangle
-from stereovox.evaluate.grids.grid_scores import CellErrors, cell_errors, differences, laid_on
+from stereovox.evaluate.grid_align import Rectangle
+from stereovox.evaluate.grid_scores import CellErrors, cell_errors, differences, laid_on
 from stereovox.formats.map_server import read_map_server
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.ros.background import Background

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.evaluate.metrics import by_part, compare_map, find_pieces
-from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import Truth, exact_occupancy
+from stereovox.evaluate.truth_cells import Sightings
 from stereovox.frame import Frame, UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.runs.recording import MapResult, MapRun
@@ -22,7 +22,7 @@ from stereovox.simulate.simulation import Simulation
 from stereovox.sources.base import Stream
 from stereovox.view.picture import picture
 from stereovox.view.report.demo import write_report
-from stereovox.view.report.folder import out_folder
+from stereovox.view.report.page import out_folder
 
 MIN_FRAMES = 20
 """A cell must be in the map once this many frames saw it."""

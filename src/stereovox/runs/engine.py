@@ -26,7 +26,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 from stereovox.config import Config
 from stereovox.errors import MapFileError, SourceError, StereovoxError
-from stereovox.evaluate.summary import mostly_lost, summarise
+from stereovox.evaluate.metrics import mostly_lost, summarise
 from stereovox.frame import UpdateReport
 from stereovox.mapper import AnyMapper
 from stereovox.maps import VoxelMap

@@ -29,7 +29,7 @@ from stereovox.maps.files.lock import only_writer_in
 from stereovox.maps.files.store import check_target, is_boxed, is_map, read_manifest, remove_map, sweep
 from stereovox.maps.record.history import MAX_NAME_LENGTH
 from stereovox.opening import Source, Stream
-from stereovox.products.floor.floor_axes import upright_axes
+from stereovox.products.floor_axes import upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.runs.engine import (
     SURVEYED,

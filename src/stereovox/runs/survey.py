@@ -16,7 +16,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import AnyFrame, Cloud, Frame, Range, Rays, StereoFrame
 from stereovox.geometry.se3 import Transform, inverse, rigidity_error, rotation_vector
-from stereovox.products.floor.floor_axes import nearest_axis, up_of, upright_axes
+from stereovox.products.floor_axes import nearest_axis, up_of, upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.sources.base import Source, Stream
 from stereovox.track.tracker import LEVEL as AHEAD

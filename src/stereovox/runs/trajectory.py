@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.evaluate.summary import percentiles
-from stereovox.evaluate.trajectory.trajectory_motions import travelled_m
-from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore, score_trajectory
+from stereovox.evaluate.metrics import percentiles
+from stereovox.evaluate.trajectory_score import TrajectoryScore, score_trajectory, travelled_m
 from stereovox.files.safe_io import check_file
 from stereovox.frame import AnyFrame, Progress, no_progress
 from stereovox.geometry.se3 import Transform

@@ -19,7 +19,7 @@ from stereovox.localize.slam.line_map import cloud_of
 from stereovox.localize.slam.loops import ClosureSearch
 from stereovox.localize.slam.pipeline import Slam
 from stereovox.mapper import GridMapper, Mapper
-from stereovox.products.floor.live_projection import LiveProjection
+from stereovox.products.projection import LiveProjection
 from stereovox.sources.poses.tracker import AXES
 from stereovox.track.tracker import Tracker
 

@@ -26,7 +26,7 @@ from stereovox.geometry.se3 import (
     rotation_vector,
 )
 from stereovox.kernels.threads import Ahead
-from stereovox.products.floor.floor_axes import up_of
+from stereovox.products.floor_axes import up_of
 from stereovox.sources.imu import Imu
 from stereovox.track.fit import RIGID, Fit, Limits, deviations
 from stereovox.track.inertial import Gyroscope, Turn, up_by_force

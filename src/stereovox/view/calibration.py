@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration, WallResult
-from stereovox.view.figures import blank, labels, png_of
-from stereovox.view.panels import GREY, title
+from stereovox.view.figures import GREY, blank, labels, png_of, title
 
 DPI = 150
 WIDTH = 11.0

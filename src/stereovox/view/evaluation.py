@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts of an evaluation: by frame (Valenti 2018, Fig 8.4), threshold and distance; ROC, reliability."""
+"""Charts of an evaluation: by frame (Valenti 2018, Fig 8.4), threshold and distance; ROC, reliability.
+
+Right and wrong cells of a map, seen from above. Picture of missions: the share of the air known to be free, over time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.curves import PrecisionRecall, Roc
-from stereovox.evaluate.distance import ByDistance
-from stereovox.evaluate.reliability import Reliability
+from stereovox.evaluate.curves import ByDistance, PrecisionRecall, Reliability, Roc
+from stereovox.evaluate.decisions import Outcome, Outcomes
 from stereovox.evaluate.scores import Scores
-from stereovox.view.figures import blank, labels, png_of
-from stereovox.view.panels import GREY, INK
+from stereovox.view.drawn import UPS, checked_up
+from stereovox.view.figures import DPI, GREY, INK, blank, labels, measured, png_of, title
 
-DPI = 140
+CHART_DPI = 140
 WIDTH = 12.0
 """Inches."""
 LINE_LETTERS = 74
@@ -52,7 +54,7 @@ def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         labels(axis, "frame", "")
     caption(left, "Right or wrong, all cells", "A cell counts as free until the map calls it occupied.")
     caption(right, "Likeness, and with tolerance", "Error should fall or stay level, all others should rise.")
-    return png_of(figure, DPI)
+    return png_of(figure, CHART_DPI)
 
 
 def curves_png(scores: Scores) -> bytes:
@@ -66,7 +68,7 @@ def curves_png(scores: Scores) -> bytes:
         _both(lower[1], scores.curve, scores.threshold)
     else:
         _distance(lower[1], scores.distance)
-    return png_of(figure, DPI)
+    return png_of(figure, CHART_DPI)
 
 
 def _thresholds(axis: Any, curve: PrecisionRecall, threshold: float, tolerance: int) -> None:
@@ -162,3 +164,103 @@ def legend_below(axis: Any, columns: int) -> None:
     axis.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=columns, frameon=False, fontsize=9.5, columnspacing=1.4
     )
+
+
+RIGHT, WRONG, MISS, NEVER = "#2f7fb8", "#e59a1f", "#b3205f", "#b9bec7"
+EXACT_COLOURS = {
+    "right": (RIGHT, [Outcome.HIT]),
+    "only in the map": (WRONG, [Outcome.NEAR, Outcome.FALSE]),
+    "missed": (MISS, [Outcome.FOUND, Outcome.MISSED]),
+    "never observed": (NEVER, [Outcome.UNSEEN]),
+}
+TOLERANT_COLOURS = {
+    "right": (RIGHT, [Outcome.HIT, Outcome.NEAR, Outcome.FOUND]),
+    "only in the map": (WRONG, [Outcome.FALSE]),
+    "missed": (MISS, [Outcome.MISSED]),
+    "never observed": (NEVER, [Outcome.UNSEEN]),
+}
+
+
+def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
+    """Return a PNG of two top views: exact, and with the tolerance.
+
+    A column has the mean colour of its cells. up: the axis that points up, by default from the truth's settings. Raises
+    StereovoxError for an invalid `up`.
+    """
+    up = checked_up(up or shown.up)
+    across, away, _ = UPS[up]
+    places = shown.cells[:, [across, away]]
+    low = places.min(axis=0) if len(places) else np.zeros(2, int)
+    size = (places.max(axis=0) - low + 1) if len(places) else np.ones(2, int)
+    tall = size[1] > 0.6 * size[0]
+    height = 0.8 + float(np.clip((0.46 if tall else 0.92) * WIDTH * size[1] / size[0], 2.0, 9.0))
+    figure = blank(WIDTH, height if tall else 2 * height)
+    panels = figure.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
+    extent = np.stack([low, low + size], axis=1).ravel() * shown.voxel_size
+    names = ("xyz"[across], "xyz"[away], up)
+    for axis, classes, text in ((panels[0], EXACT_COLOURS, "Exact"), (panels[1], TOLERANT_COLOURS, "With tolerance")):
+        image = mixed(places - low, shown.outcome, tuple(size), classes)
+        axis.imshow(image, origin="lower", extent=extent, interpolation="nearest")
+        title(axis, text)
+        measured(axis, names)
+    _legend(figure)
+    return png_of(figure, CHART_DPI)
+
+
+def mixed(
+    places: NDArray[np.integer],
+    outcome: NDArray[np.uint8],
+    size: tuple[int, ...],
+    classes: Mapping[str, tuple[str, list[Outcome]]],
+) -> NDArray[np.float64]:
+    """Return an image (rows, columns, 3): each pixel has the mean colour of its cells, white if there are none.
+
+    places: (M, 2) column and row of each cell; cells without a class are not drawn.
+    """
+    from matplotlib.colors import to_rgb
+
+    columns, rows = size
+    number, colour = np.zeros(rows * columns), np.zeros((rows * columns, 3))
+    for name, members in classes.values():
+        x, y = places[np.isin(outcome, members)].T
+        count = np.bincount(y * columns + x, minlength=rows * columns)
+        number += count
+        colour += count[:, None] * np.array(to_rgb(name))
+    image = np.where(number[:, None] > 0, colour / np.maximum(number, 1)[:, None], 1.0)
+    return image.reshape(rows, columns, 3)
+
+
+def _legend(figure: Any) -> None:
+    from matplotlib.patches import Patch
+
+    patches = [Patch(fc=colour, ec="#888", label=name) for name, (colour, _) in EXACT_COLOURS.items()]
+    figure.legend(handles=patches, loc="outside lower center", ncols=4, frameon=False, fontsize=10.5)
+
+
+def coverage_figure(flights: Sequence[dict[str, Any]]) -> Any:
+    """Return a figure with a panel for each scene: a grey line for each flight, the median of all in black.
+
+    flights: with `scene`, `seconds` and `coverage` [[seconds, share], ...]. A flight that ended keeps its last share;
+    a red cross marks a collision.
+    """
+    scenes = list(dict.fromkeys(flight["scene"] for flight in flights))
+    longest = max(flight["coverage"][-1][0] for flight in flights)
+    figure = blank(1.2 + 3.6 * len(scenes), 3.4)
+    for axis, scene in zip(np.ravel(figure.subplots(1, len(scenes), sharey=True, squeeze=False)), scenes, strict=True):
+        mine = [flight for flight in flights if flight["scene"] == scene]
+        times = np.linspace(0, longest, 200)
+        curves = [np.interp(times, *np.transpose(flight["coverage"])) for flight in mine]
+        for flight in mine:
+            axis.plot(*np.transpose(flight["coverage"]), color=GREY, linewidth=0.6, alpha=0.6)
+            if flight["collided_s"] is not None:
+                axis.plot(*flight["coverage"][-1], "x", color="tab:red")
+        axis.plot(times, np.median(curves, axis=0), color=INK, linewidth=1.8)
+        axis.set_title(f"{scene}, {len(mine)} flights", loc="left", fontsize=9)
+        axis.set(ylim=(0, 1), xlim=(0, longest or 1))
+        labels(axis, "seconds", "air known to be free" if scene == scenes[0] else "")
+    return figure
+
+
+def coverage_png(flights: Sequence[dict[str, Any]]) -> bytes:
+    """Return `coverage_figure` as PNG bytes."""
+    return png_of(coverage_figure(flights), DPI)

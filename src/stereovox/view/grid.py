@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Picture of a floor map: free, occupied and unknown cells, metres at the edges, and a robot's trajectory."""
+"""Picture of a floor map: free, occupied and unknown cells, metres at the edges, and a robot's trajectory.
+
+Differences of two 2-D maps: the binary image of IST 2019, Fig 6 and 9, and one with the kinds of difference.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +15,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.evaluate.grid_align import AlignedGrids, three_states
+from stereovox.evaluate.grid_scores import Difference, differences, wrong
 from stereovox.geometry import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.view.figures import WIDTH, figure_of, save, title_above
-from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
+from stereovox.view.figures import (
+    GREY,
+    INK,
+    PATH_COLOUR,
+    STATE_COLOURS,
+    WIDTH,
+    blank,
+    figure_of,
+    measured,
+    png_of,
+    save,
+    scale_bar,
+    title,
+    title_above,
+)
 
 MAX_PIXELS = 1500
 """Largest number of cells along the longer side that are drawn one per pixel; beyond, cells are pooled."""
@@ -157,3 +176,91 @@ def legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
     if with_track:
         handles.append(Line2D([], [], color=PATH_COLOUR, label="the robot's path, from dot to square"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=11, labelcolor=INK)
+
+
+DPI = 140
+DIFFERENCE_WIDTH = 12.0
+"""Inches."""
+BOTH_FREE, BOTH_OCCUPIED, BOTH_UNKNOWN = 10, 11, 12
+"""Classes of cells that do not differ."""
+KINDS = {
+    BOTH_UNKNOWN: ("unknown to both", "#cfd4db"),
+    BOTH_FREE: ("both free", "#eef1f4"),
+    Difference.FORGIVEN: ("differs, but excluded", "#9bc59d"),
+    Difference.MISSED: ("missed: only the reference knows", "#8fb8de"),
+    Difference.EXTRA: ("extra: only the map knows", "#e9c46a"),
+    BOTH_OCCUPIED: ("both occupied", "#5a6577"),
+    Difference.WRONGLY_FREE: ("wrongly free", "#8b1e5b"),
+    Difference.WRONGLY_OCCUPIED: ("wrongly occupied", "#d1603d"),
+}
+"""Name and colour; if one pixel covers several cells, the last of these is shown."""
+
+
+def binary_png(laid: AlignedGrids) -> bytes:
+    """Return a PNG with one pixel per cell, north up: white where the maps differ, else black (IST 2019)."""
+    from matplotlib.image import imsave
+
+    out = io.BytesIO()
+    imsave(out, wrong(differences(laid))[::-1], cmap="gray", vmin=0, vmax=1, format="png")
+    return out.getvalue()
+
+
+def classes(laid: AlignedGrids) -> NDArray[np.uint8]:
+    """Return for each cell, (rows, columns) uint8, its `Difference`, or if there is none the common state."""
+    found = differences(laid)
+    same = np.full(len(State), BOTH_UNKNOWN, np.uint8)
+    same[State.FREE], same[State.OCCUPIED] = BOTH_FREE, BOTH_OCCUPIED
+    return np.where(found == Difference.SAME, same[three_states(laid.reference)], found)
+
+
+def difference_png(laid: AlignedGrids) -> bytes:
+    """Return a PNG with the kinds of difference in colours, in metres of the reference's frame."""
+    box = _box(laid)
+    figure, (axis,) = _panels(box, 1)
+    paint(axis, laid.reference, classes(laid), {int(kind): colour for kind, (_, colour) in KINDS.items()})
+    axis.set_facecolor(KINDS[BOTH_UNKNOWN][1])
+    framed(axis, box)
+    _legend(figure)
+    return png_of(figure, DPI)
+
+
+def side_by_side_png(laid: AlignedGrids, names: tuple[str, str] = ("Reference", "Map")) -> bytes:
+    """Return a PNG of the reference, the map, and the binary difference (white: an error), all in one frame."""
+    box = _box(laid)
+    figure, panels = _panels(box, 3)
+    max_px = int(0.74 * DPI * DIFFERENCE_WIDTH) // (1 if _is_wide(box) else 3)
+    for axis, grid in zip(panels, (laid.reference, laid.map), strict=False):
+        plan(axis, grid, max_px=max_px)
+    paint(panels[2], laid.reference, wrong(differences(laid)).astype(np.uint8), {0: "black", 1: "white"}, max_px)
+    panels[2].set_facecolor("black")
+    for axis, name in zip(panels, (*names, "Difference (white: an error)"), strict=True):
+        axis.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))
+        title(axis, name)
+    return png_of(figure, DPI)
+
+
+def _box(laid: AlignedGrids) -> Box:
+    """Return the box of all cells known to either map."""
+    box = bounds(replace(laid.reference, cells=np.maximum(laid.map.cells, laid.reference.cells)))
+    return box if box is not None else (np.zeros(2), np.ones(2))
+
+
+def _is_wide(box: Box) -> bool:
+    width, height = box[1] - box[0]
+    return bool(height < 0.5 * width)
+
+
+def _panels(box: Box, number: int) -> tuple[Any, list[Any]]:
+    """Return a figure with panels side by side or, for wide maps, stacked."""
+    width, height = box[1] - box[0]
+    rows, columns = (number, 1) if _is_wide(box) else (1, number)
+    inches = float(np.clip(0.93 * DIFFERENCE_WIDTH / columns * height / width, 1.6, 11.0)) + 0.7
+    figure = blank(DIFFERENCE_WIDTH, inches * rows + (0.8 if number == 1 else 0))
+    return figure, list(figure.subplots(rows, columns, squeeze=False).ravel())
+
+
+def _legend(figure: Any) -> None:
+    from matplotlib.patches import Patch
+
+    patches = [Patch(fc=colour, ec="#888", label=name) for name, colour in KINDS.values()]
+    figure.legend(handles=patches, loc="outside lower center", ncols=4, frameon=False, fontsize=10)

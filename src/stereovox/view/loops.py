@@ -14,12 +14,11 @@ from stereovox.correct.close_loops import LoopClosure
 from stereovox.geometry.se3 import inverse
 from stereovox.mapping.rebuild import CORRECTED
 from stereovox.maps import State, VoxelMap
-from stereovox.products.crop import crop
-from stereovox.products.floor.floor_axes import floor_axes
-from stereovox.products.floor.ground_surfaces import floor_of
-from stereovox.view.figures import figure_of, save, title_above
-from stereovox.view.panels import HALO, INK, STATE_COLOURS, measured, scale_bar, title
-from stereovox.view.scene.above import draw_columns
+from stereovox.products.edit import crop
+from stereovox.products.floor_axes import floor_axes
+from stereovox.products.ground import floor_of
+from stereovox.view.above import draw_columns
+from stereovox.view.figures import HALO, INK, STATE_COLOURS, figure_of, measured, save, scale_bar, title, title_above
 
 BEFORE, AFTER, CLOSED, REFUSED = "#969dab", "#2458b8", "#1f9d55", "#c2185b"
 """Colours of the trajectories and of loops."""

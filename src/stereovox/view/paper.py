@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor.slices import Layer
-from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, round_length
+from stereovox.products.floor_axes import Layer
+from stereovox.view.drawn import Drawn, camera_path, checked_up, turned, upright
+from stereovox.view.figures import INK, PATH_COLOUR, STATE_COLOURS, round_length
+from stereovox.view.layer import shown_height, upright_layer
 from stereovox.view.picture import TOP, height_colours
-from stereovox.view.scene.drawn import Drawn, camera_path, checked_up, turned, upright
-from stereovox.view.scene.layer import shown_height, upright_layer
-from stereovox.view.scene.render import Direction, render
-from stereovox.view.scene.space import ABOVE_DEG, BEHIND_DEG
+from stereovox.view.render import Direction, render
+from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 
 MM = 1 / 25.4
 """Inches."""

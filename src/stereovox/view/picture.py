@@ -10,10 +10,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.maps import VoxelMap
-from stereovox.view.figures import DPI, WIDTH, figure_of, headline, keep_clear, save
-from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
-from stereovox.view.scene.drawn import Drawn, camera_path, upright
-from stereovox.view.scene.render import Direction, extent
+from stereovox.view.drawn import Drawn, camera_path, upright
+from stereovox.view.figures import (
+    DPI,
+    GREY,
+    WIDTH,
+    figure_of,
+    headline,
+    keep_clear,
+    measured,
+    oblique,
+    save,
+    slice_,
+    title,
+    view,
+)
+from stereovox.view.render import Direction, extent
 
 LONG = 1.8
 """A map this many times longer than wide runs across the whole page."""

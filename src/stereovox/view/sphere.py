@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.depth.sphere import SphereGrid
 from stereovox.frame import Reason
-from stereovox.view.figures import figure_of, save
-from stereovox.view.panels import GREY, INK
+from stereovox.view.figures import GREY, INK, figure_of, save
 
 UNKNOWN = "#8d9296"
 FREE = "#e9eef2"

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.trajectory.pose_pairs import MAX_GAP_INTERVALS
-from stereovox.evaluate.trajectory.trajectory_motions import SegmentErrors, travelled_m
-from stereovox.evaluate.trajectory.trajectory_score import MIN_EXTENT_M, TrajectoryScore
+from stereovox.evaluate.trajectory import MAX_GAP_INTERVALS
+from stereovox.evaluate.trajectory_score import MIN_EXTENT_M, SegmentErrors, TrajectoryScore, travelled_m
 from stereovox.view.evaluation import PRECISION, RECALL, WIDTH, caption
-from stereovox.view.figures import blank, labels, png_of, save
-from stereovox.view.panels import GREY, INK, title
+from stereovox.view.figures import GREY, INK, blank, labels, png_of, save, title
 
 DPI = 140
 TRUTH, ESTIMATE, LOST = INK, RECALL, "#c2185b"

@@ -10,13 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.record.loop_lines import LoopLines
-from stereovox.products.floor.floor_axes import upright_axes
+from stereovox.maps.record.camera_path import LoopLines
+from stereovox.products.floor_axes import upright_axes
+from stereovox.view.drawn import UPS, checked_up, field_of_view
+from stereovox.view.figures import PATH_COLOUR
 from stereovox.view.loops import CLOSED, REFUSED
-from stereovox.view.panels import PATH_COLOUR
-from stereovox.view.scene.drawn import UPS, checked_up
-from stereovox.view.scene.space import ABOVE_DEG, BEHIND_DEG
-from stereovox.view.scene.viewpoint import field_of_view
+from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 from stereovox.viewer.cells import rgb
 
 if TYPE_CHECKING:

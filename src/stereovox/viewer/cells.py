@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.cells import keys, position
+from stereovox.evaluate.truth import keys, position
 from stereovox.kernels.threads import Newest
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor.floor_axes import floor_axes
-from stereovox.view.panels import STATE_COLOURS
+from stereovox.products.floor_axes import floor_axes
+from stereovox.view.drawn import stood_up
+from stereovox.view.figures import STATE_COLOURS
+from stereovox.view.layer import COLOURS
 from stereovox.view.picture import height_scale
-from stereovox.view.scene.drawn import stood_up
-from stereovox.view.scene.scale import COLOURS
-from stereovox.view.scene.shading import Occlusion
+from stereovox.view.render import Occlusion
 from stereovox.viewer.chunks import MAX_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from stereovox.frame import (
     UpdateReport,
     name_of,
 )
-from stereovox.view.scene.plain import colour_depth
+from stereovox.view.plain import colour_depth
 from stereovox.viewer.panel import plain
 
 if TYPE_CHECKING:

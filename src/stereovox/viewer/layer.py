@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from stereovox.kernels.threads import Newest
 from stereovox.maps import State, VoxelMap
-from stereovox.products.floor.slices import Layer, layer
-from stereovox.view.scene.drawn import stood_up
-from stereovox.view.scene.scale import Scale, scale_of
+from stereovox.products.floor_axes import Layer, layer
+from stereovox.view.drawn import stood_up
+from stereovox.view.layer import Scale, scale_of
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.maps import VoxelMap
-from stereovox.view.scene.axis import draw_profile
+from stereovox.view.layer import draw_profile
 
 WIDTH_IN, DPI = 4.8, 180
 """Width of the panel's pictures in inches, relative to text size, and pixels per inch."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.floor_axes import upright_axes
-from stereovox.view.scene.drawn import checked_up
+from stereovox.products.floor_axes import upright_axes
+from stereovox.view.drawn import checked_up
 from stereovox.viewer.cameras import Cameras, as_tuple, first_look, up_vector
 from stereovox.viewer.cells import Cells
 from stereovox.viewer.chunks import MAX_CELLS

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.files.safe_io import replacing
-from stereovox.view.figures import blank, labels, png_of
-from stereovox.view.panels import GREY, INK, LINE
+from stereovox.view.figures import GREY, INK, LINE, blank, labels, png_of
 from stereovox_lab.bench.machine import machine_line
 from stereovox_lab.bench.more import MEASUREMENTS
 from stereovox_lab.bench.results import Table, comparison_table, is_ours, rows_by_size

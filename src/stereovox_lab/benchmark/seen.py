@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
-from stereovox.evaluate.cells import Keys, indices, keys, position
 from stereovox.evaluate.lidar_truth import CELLS, blocks_in, view_volume
+from stereovox.evaluate.truth import Keys, indices, keys, position
 from stereovox.frame import Viewpoint
 from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.maps import VoxelMap

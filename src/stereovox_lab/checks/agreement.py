@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.cells import keys, within
+from stereovox.evaluate.truth import keys, within
 from stereovox.maps import State, VoxelMap
 
 

@@ -79,7 +79,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the comparison and all requested measurements; print the tables and write the files."""
-    from stereovox.view.report.folder import out_folder
+    from stereovox.view.report.page import out_folder
     from stereovox_lab.bench import files
 
     folder = out_folder(arguments.out) if arguments.out is not None else None

@@ -42,7 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the benchmark; print the tables and write page and figures."""
-    from stereovox.view.report.folder import out_folder
+    from stereovox.view.report.page import out_folder
     from stereovox_lab.benchmark.data import SEEDS
     from stereovox_lab.benchmark.run import run_benchmark
     from stereovox_lab.report import benchmark as report

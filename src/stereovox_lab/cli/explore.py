@@ -51,7 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Fly the missions; print the table and write the report."""
-    from stereovox.view.report.folder import out_folder
+    from stereovox.view.report.page import out_folder
     from stereovox_lab.flights.campaign import SCENES, explore
     from stereovox_lab.flights.explore import Cruise
     from stereovox_lab.report import missions as report

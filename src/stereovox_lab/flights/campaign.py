@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
-from stereovox.products.floor.level_ways import Waypoints
+from stereovox.products.level_ways import Waypoints
 from stereovox.simulate.simulation import Simulation
 from stereovox_lab.flights.explore import Cruise, Frontiers, MiddleOfRoom, Mission, fly
 from stereovox_lab.flights.flight import World

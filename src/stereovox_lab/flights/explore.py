@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from stereovox.geometry.se3 import Transform
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.level_ways import Leg, LevelPlanner, Waypoints, frontiers_around
 from stereovox.products.frontiers import Frontier
+from stereovox.products.level_ways import Leg, LevelPlanner, Waypoints, frontiers_around
 from stereovox.products.path_check import check_path, path_length, point_along
 from stereovox_lab.flights.air import Air
 from stereovox_lab.flights.flight import STEP_S, World

@@ -12,8 +12,7 @@ from typing import Any
 
 from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import replacing
-from stereovox.view.report.folder import out_folder
-from stereovox.view.report.page import figure, page, section, table, tiles
+from stereovox.view.report.page import figure, out_folder, page, section, table, tiles
 from stereovox_lab.papers.chapter import Chapter, Claim, Progress, Sheet, Shown, count
 
 HEADS = ("claim", "thesis", "ours", "holds?")

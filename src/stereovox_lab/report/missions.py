@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stereovox.view.coverage import coverage_png
+from stereovox.view.evaluation import coverage_png
 from stereovox.view.report import page
 
 HEADS = ("scene", "flights", "collisions", "ended by itself", "metres", "goals", "least clearance, m",

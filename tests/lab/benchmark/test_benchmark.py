@@ -15,9 +15,8 @@ from made_frames import a_frame
 import stereovox as sv
 from stereovox.cli import main
 from stereovox.errors import ConfigError, MissingExtra, SourceError, StereovoxError
-from stereovox.evaluate.cells import indices, keys, position
 from stereovox.evaluate.lidar_truth import lidar_truth
-from stereovox.evaluate.truth import exact_occupancy
+from stereovox.evaluate.truth import exact_occupancy, indices, keys, position
 from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.geometry.se3 import look_at
 from stereovox.simulate.simulation import Simulation

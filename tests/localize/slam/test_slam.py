@@ -11,7 +11,7 @@ from made_drives import along, box, drive, ring
 
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
-from stereovox.evaluate.trajectory.trajectory import read_relations, relation_errors
+from stereovox.evaluate.trajectory import read_relations, relation_errors
 from stereovox.geometry import se2
 from stereovox.localize.slam.pipeline import SCANS_PER_KEYFRAME, KeyframeMap, Slam, map_scans
 from stereovox.mapper import GridMapper

@@ -4,10 +4,9 @@
 import numpy as np
 
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.maps.record.camera_path import StampedPose
+from stereovox.maps.record.camera_path import LoopLines, StampedPose
 from stereovox.maps.record.corrected import correct_history, matrix_of
 from stereovox.maps.record.history import DisagreementSpell, History, ImageFingerprint, Streak
-from stereovox.maps.record.loop_lines import LoopLines
 
 
 def seen(stamp_ns, x, turn=0.0):

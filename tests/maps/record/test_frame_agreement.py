@@ -7,8 +7,8 @@ import pytest
 from stereovox.config import load_config
 from stereovox.maps import VoxelMap
 from stereovox.maps.cells.evidence import Evidence
-from stereovox.maps.record import frame_agreement
-from stereovox.maps.record.frame_agreement import FEW, KNOWN, SEEN_THROUGH, Agreement
+from stereovox.maps.record import glance as frame_agreement
+from stereovox.maps.record.glance import FEW, KNOWN, SEEN_THROUGH, Agreement
 
 FIRM = 1600
 

@@ -10,9 +10,8 @@ from made_manifest import manifest_in, put_manifest
 
 import stereovox as sv
 from stereovox.errors import MapFileError
-from stereovox.maps.record.camera_path import CameraPath
+from stereovox.maps.record.camera_path import CameraPath, LoopLines
 from stereovox.maps.record.history import MAX_REASONS, OTHERS, History, StampedPose, Streak
-from stereovox.maps.record.loop_lines import LoopLines
 
 POSE = tuple(float(x) / 3 for x in range(12))
 FULL = History(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.geometry.se3 import rotation_matrix, transform_points
-from stereovox.maps.record.loop_lines import MAX_LINES, Lines, LoopLines
+from stereovox.maps.record.camera_path import MAX_LINES, Lines, LoopLines
 
 
 def made(number, seed=0):

@@ -14,7 +14,7 @@ from stereovox.errors import ConfigError, FrameRefused
 from stereovox.maps import VoxelMap, load_map, make_map
 from stereovox.maps.cells.evidence import Evidence, GridEvidence
 from stereovox.maps.grid_map import GridMap
-from stereovox.maps.storage.memory import within_memory
+from stereovox.maps.storage.window import within_memory
 
 TIMES = {"map.keep_times": True}
 

@@ -10,12 +10,12 @@ from matplotlib.image import imread
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.decision_words import percent
-from stereovox.evaluate.outcomes import Outcome, Outcomes, outcomes
+from stereovox.evaluate.decisions import Outcome, Outcomes, outcomes, percent
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells
-from stereovox.view.evaluation import curves_png, series_png
-from stereovox.view.outcomes import EXACT, MISS, RIGHT, TOLERANT, WRONG, mixed, outcomes_png
+from stereovox.view.evaluation import EXACT_COLOURS as EXACT
+from stereovox.view.evaluation import MISS, RIGHT, WRONG, curves_png, mixed, outcomes_png, series_png
+from stereovox.view.evaluation import TOLERANT_COLOURS as TOLERANT
 from stereovox.view.report.evaluation import Evaluated, evaluation_page, write_evaluation_report
 from stereovox_lab.papers.valenti.judge import ScoreSeries
 

@@ -57,8 +57,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         write_difference(changes, a.config.cell, arguments.out)
         say(f"saved {arguments.out}")
     if arguments.picture:
+        from stereovox.view.above import draw_changes
         from stereovox.view.figures import save
-        from stereovox.view.scene.above import draw_changes
 
         save(draw_changes(a, b, f"{Path(arguments.a).stem} to {Path(arguments.b).stem}"), arguments.picture)
         say(f"saved {arguments.picture}")

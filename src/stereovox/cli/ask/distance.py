@@ -109,8 +109,8 @@ def _print_result(field: DistanceField, arguments: Namespace) -> dict[str, Any]:
 
 
 def _draw(field: DistanceField, voxel_map: VoxelMap, arguments: Namespace) -> None:
-    from stereovox.view.distance import picture_distance
-    from stereovox.view.scene.drawn import turned
+    from stereovox.view.drawn import turned
+    from stereovox.view.path import picture_distance
 
     at_m, up = arguments.at, voxel_map.config.up
     if at_m is None and voxel_map.viewpoint is not None:

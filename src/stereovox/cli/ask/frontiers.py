@@ -52,8 +52,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         write_frontiers(found, arguments.out)
         say(f"saved {arguments.out}")
     if arguments.picture:
+        from stereovox.view.above import draw_frontiers
         from stereovox.view.figures import save
-        from stereovox.view.scene.above import draw_frontiers
 
         save(draw_frontiers(voxel_map, found, f"{Path(arguments.map).stem}: frontiers"), arguments.picture)
         say(f"saved {arguments.picture}")

@@ -17,7 +17,7 @@ from stereovox.cli.terminal import say, thousands
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
-    from stereovox.products.floor.ground import Ground
+    from stereovox.products.ground import Ground
 
 EXAMPLES = """stereovox ground room.svox ground.png --height 1.2 --max-step 0.05
 stereovox ground room.svox ground.npz"""
@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map, find its ground, write it and print a summary."""
-    from stereovox.products.floor.ground import Robot, ground
+    from stereovox.products.ground import Robot, ground
 
     check_ending("FILE", arguments.file, ".npz", ".yaml", ".pgm", ".png")
     robot = Robot(arguments.height, arguments.radius, arguments.max_step, arguments.max_slope)
@@ -66,12 +66,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
     ending = Path(arguments.file).suffix.lower()
     if ending == ".png":
+        from stereovox.view.above import draw_ground
         from stereovox.view.figures import save
-        from stereovox.view.scene.above import draw_ground
 
         save(draw_ground(voxel_map, found, f"{Path(arguments.map).stem}: ground"), arguments.file)
     elif ending == ".npz":
-        from stereovox.products.floor.ground import write_ground
+        from stereovox.products.ground import write_ground
 
         write_ground(found, arguments.file)
     else:
@@ -83,7 +83,7 @@ def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
 def _print_result(found: Ground, file: str) -> dict[str, Any]:
     import numpy as np
 
-    from stereovox.products.floor.ground import Footing
+    from stereovox.products.ground import Footing
 
     number = np.bincount(found.footing.ravel(), minlength=len(Footing)).tolist()
     counts = {footing.name.lower(): number[footing] for footing in Footing}

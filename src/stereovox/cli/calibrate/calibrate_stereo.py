@@ -53,7 +53,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     _print_result(found, arguments, alone)
     result = {**found.as_dict(), "unmatched": alone, "out": arguments.out}
     if arguments.report:
-        from stereovox.view.report.stereo import write_stereo_report
+        from stereovox.view.report.calibration import write_stereo_report
 
         result["report"] = str(write_stereo_report(arguments.report, found, arguments.out))
         say(f"report: {result['report']}")

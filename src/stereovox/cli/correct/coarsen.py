@@ -21,7 +21,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and save it with larger cells."""
-    from stereovox.products.coarsen import coarsen
+    from stereovox.products.edit import coarsen
 
     check_new(arguments.out, arguments.map)
     return save_new(coarsen(open_map(arguments.map), arguments.factor), arguments.out)

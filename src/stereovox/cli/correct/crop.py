@@ -28,7 +28,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and save the cropped one."""
-    from stereovox.products.crop import crop
+    from stereovox.products.edit import crop
 
     box = numbers_of("--box", arguments.box, CORNERS)
     check_new(arguments.out, arguments.map)

@@ -71,7 +71,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _doubts(merged: VoxelMap) -> Doubts:
     """Return a doubt if most of the frames of both maps are missing from the result."""
-    from stereovox.evaluate.summary import mostly_lost
+    from stereovox.evaluate.metrics import mostly_lost
 
     return mostly_lost(merged.frames, merged.frames + merged.frames_refused, "frames of both")
 

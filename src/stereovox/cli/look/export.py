@@ -17,7 +17,7 @@ from stereovox.cli.options import heights_of, point
 from stereovox.cli.terminal import say, size
 
 if TYPE_CHECKING:
-    from stereovox.products.floor.floor_heights import FloorHeights
+    from stereovox.products.floor_heights import FloorHeights
 
 EXAMPLES = """stereovox export kitchen.svox kitchen.bt
 stereovox export kitchen.svox kitchen.ply"""
@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and export it."""
     from stereovox.formats import BAGS, FLAT, export
-    from stereovox.products.floor.floor_heights import CURE, NO_FLOOR, FloorHeights, floor_of_map
+    from stereovox.products.floor_heights import CURE, NO_FLOOR, FloorHeights, floor_of_map
 
     file, heights = Path(arguments.file), heights_of(arguments.heights)
     ending = file.suffix.lower()

@@ -56,8 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.view.figures import checked_ending, save
-    from stereovox.view.scene.dark import darken
+    from stereovox.view.figures import checked_ending, darken, save
 
     arguments.file = arguments.file or _usual_file(arguments.map)
     file = Path(arguments.file)
@@ -84,10 +83,9 @@ def _usual_file(path: str) -> str:
 def _draw_cells(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a 3-D map."""
     from stereovox.products.moved import levelled
+    from stereovox.view.drawn import checked_up, viewpoint_at
     from stereovox.view.paper import draw_paper
-    from stereovox.view.scene.drawn import checked_up
-    from stereovox.view.scene.viewpoint import viewpoint_at
-    from stereovox.view.scene.views import draw_view
+    from stereovox.view.views import draw_view
 
     arguments.view = arguments.view or "overview"
     _check_options(arguments)

@@ -45,7 +45,7 @@ def add_start(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the trajectory and print its end."""
-    from stereovox.evaluate.summary import mostly_lost
+    from stereovox.evaluate.metrics import mostly_lost
     from stereovox.localize.robot_track import check_start, fit_of, localise_robot, parse_start, refused_line
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)

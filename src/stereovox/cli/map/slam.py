@@ -46,7 +46,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
-    from stereovox.evaluate.trajectory.trajectory import read_relations
+    from stereovox.evaluate.trajectory import read_relations
     from stereovox.formats.map_server import write_map_server
     from stereovox.localize.robot_track import doubt_lines, slam_robot
 
@@ -70,7 +70,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
 
 def _print_result(robot: Robot, found: SlamResult, seconds: float, compiling: bool) -> dict[str, Any]:
-    from stereovox.evaluate.summary import mostly_lost
+    from stereovox.evaluate.metrics import mostly_lost
     from stereovox.localize.robot_track import refused_line
 
     track, refused = found.track, sum(found.refused.values())
@@ -97,7 +97,7 @@ def _pace(recorded: float, seconds: float, compiling: bool) -> str:
 def _score(found: SlamResult, relations: str | None) -> dict[str, Any]:
     if relations is None:
         return {}
-    from stereovox.evaluate.trajectory.trajectory import score_relations
+    from stereovox.evaluate.trajectory import score_relations
 
     score = score_relations(found.track, Path(relations))
     say(score.line())

@@ -14,7 +14,7 @@ from stereovox.cli.options import add_settings, add_usual, check_ending, options
 from stereovox.cli.terminal import command_line, progress_of_steps, say, say_about_compiling, say_lost
 
 if TYPE_CHECKING:
-    from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore
+    from stereovox.evaluate.trajectory_score import TrajectoryScore
 
 ALIKE = ("profile", "max_range", "frames", "camera")
 """Options that `map` has too, and that affect poses."""

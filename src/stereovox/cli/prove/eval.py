@@ -22,7 +22,7 @@ from stereovox.cli.terminal import command_line, say, say_table, thousands
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
-    from stereovox.evaluate.grids.grid_scores import GridScores
+    from stereovox.evaluate.grid_scores import GridScores
     from stereovox.evaluate.scores import Scores
 
 DIFFERENCES = {
@@ -133,7 +133,7 @@ def _holds_poses(path: str) -> bool:
 
 def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
     """Pair the poses of two files, print and report their differences."""
-    from stereovox.evaluate.trajectory.trajectory_score import score_trajectory
+    from stereovox.evaluate.trajectory_score import score_trajectory
     from stereovox.view.report import trajectory as report
 
     refuse_options(arguments, ("threshold", "tolerance", "path", "exclude"), "only for maps")
@@ -170,7 +170,7 @@ def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
 
 def _compare_grids(arguments: Namespace) -> dict[str, Any]:
     """Load two floor maps, align them, compare them, print and report the scores."""
-    from stereovox.evaluate.grids.grid_scores import laid_on, score_laid
+    from stereovox.evaluate.grid_scores import laid_on, score_laid
     from stereovox.evaluate.truth_cells import level
 
     refuse_options(arguments, ("path",), "distances from a camera do not apply to floor maps")
@@ -195,8 +195,8 @@ def _compare_grids(arguments: Namespace) -> dict[str, Any]:
 
 
 def _compare_cells(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.evaluate.decisions import outcomes
     from stereovox.evaluate.inputs import path_fits, read_camera_path, read_map
-    from stereovox.evaluate.outcomes import outcomes
     from stereovox.evaluate.scores import score
     from stereovox.evaluate.truth_cells import TruthCells, level
 
@@ -234,7 +234,7 @@ COMPARE = {2: _compare_grids, 3: _compare_cells}
 
 
 def _print_decisions(scores: Scores) -> None:
-    from stereovox.evaluate import decision_words as words
+    from stereovox.evaluate import decisions as words
 
     say_table(words.HEADS, words.state_rows(scores.decisions))
     say_table(words.ERROR_HEADS, words.error_rows(scores.decisions, scores.tolerance_cells))

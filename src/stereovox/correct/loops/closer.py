@@ -29,7 +29,7 @@ from stereovox.geometry.pose_graph import HELD, Edge, PoseGraph, Position, Uprig
 from stereovox.geometry.se3 import Transform, interpolate, inverse, orthonormalise, rotation_between
 from stereovox.maps.record.history import History
 from stereovox.maps.record.kept_frames import KeptFrame
-from stereovox.products.floor.floor_axes import up_of
+from stereovox.products.floor_axes import up_of
 
 LEAST_WAY_M = 3.0
 """Least path in metres between two visits that form a loop."""

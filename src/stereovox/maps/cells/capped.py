@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused
-from stereovox.maps.cells.cell_pool import CellPool
-from stereovox.maps.cells.cell_times import CellTimes
+from stereovox.maps.cells.cell_pool import CellPool, CellTimes
 from stereovox.maps.cells.evidence import Evidence
-from stereovox.maps.storage.memory import format_bytes, most_blocks
 from stereovox.maps.storage.storage import Storage
+from stereovox.maps.storage.window import format_bytes, most_blocks
 from stereovox.maps.voxel_map import VoxelMap
 
 

@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps.cells.cell_format import CellRules, State, Thresholds
-from stereovox.maps.query import _query, _query_nearest, _query_rays, _query_solids
+from stereovox.maps.query import _query, _query_solids
+from stereovox.maps.query import _query as _query_nearest
+from stereovox.maps.query import _query as _query_rays
 from stereovox.maps.storage.blocks import StoredCells
 
 INDEX_LIMIT = 2**30

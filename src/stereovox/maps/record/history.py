@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stereovox.errors import one_line, shortened
-from stereovox.maps.record.camera_path import FARTHEST, CameraPath
+from stereovox.maps.record.camera_path import FARTHEST, CameraPath, LoopLines
 from stereovox.maps.record.camera_path import StampedPose as StampedPose
 from stereovox.maps.record.glance import Glance
-from stereovox.maps.record.loop_lines import LoopLines
 
 MAX_SENSORS = 64
 """Most sensors that one map distinguishes."""

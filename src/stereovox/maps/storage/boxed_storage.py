@@ -17,16 +17,15 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.files.places import AT_ONCE, Place
 from stereovox.frame import Viewpoint
-from stereovox.maps.cells.cell_pool import PIECE, CellPool
-from stereovox.maps.cells.cell_times import LAST, NEVER, UNIT_NS, CellTimes
+from stereovox.maps.cells.cell_pool import LAST, NEVER, PIECE, UNIT_NS, CellPool, CellTimes
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.files.boxed_manifest import BoxedManifest
 from stereovox.maps.query import queries
 from stereovox.maps.query.queries import INDEX_LIMIT
 from stereovox.maps.storage.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.storage.boxes import BoxBlocks, BoxEntry, Index, read_box
-from stereovox.maps.storage.memory import format_bytes
 from stereovox.maps.storage.storage import Blocks, Storage
+from stereovox.maps.storage.window import format_bytes
 
 CACHE_BYTES = 256_000_000
 """Memory for recently used boxes."""

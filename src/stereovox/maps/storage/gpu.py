@@ -21,7 +21,7 @@ from stereovox.kernels.device import check_device
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.cell_pool import GROWTH, CellPool
 from stereovox.maps.cells.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
-from stereovox.maps.record.frame_agreement import Agreement, sampled
+from stereovox.maps.record.glance import Agreement, sampled
 from stereovox.maps.storage import _gpu
 from stereovox.maps.storage.blocks import CELLS, StoredCells, table_size
 from stereovox.maps.storage.storage import Storage

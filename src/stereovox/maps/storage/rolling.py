@@ -14,16 +14,14 @@ from stereovox.config import Config, WindowConfig
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.maps.cells.cell_format import CellFormat
-from stereovox.maps.cells.cell_pool import CellPool
-from stereovox.maps.cells.cell_times import NEVER, CellTimes
+from stereovox.maps.cells.cell_pool import NEVER, CellPool, CellTimes
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.query.queries import INDEX_LIMIT
 from stereovox.maps.storage import _window
 from stereovox.maps.storage.blocks import CELLS, SIDE, StoredCells
-from stereovox.maps.storage.memory import window_blocks, within_memory
 from stereovox.maps.storage.storage import Blocks, Storage
 from stereovox.maps.storage.tiles import BLOCKS, INNER, TILE, Tile, TileStore, blocks_of, slabs_of
-from stereovox.maps.storage.window import Box, Window, coarser, without
+from stereovox.maps.storage.window import Box, Window, coarser, window_blocks, within_memory, without
 from stereovox.maps.voxel_map import VoxelMap
 
 TIMES = CellFormat(np.dtype(np.uint32), NEVER, 1.0)

@@ -19,12 +19,11 @@ from stereovox.frame import Viewpoint
 from stereovox.kernels.threads import Guarded, MapLock, in_steps
 from stereovox.maps.cells import _add, _pool
 from stereovox.maps.cells.cell_format import CellRules
-from stereovox.maps.cells.cell_pool import CellPool
-from stereovox.maps.cells.cell_times import NEVER, CellTimes
+from stereovox.maps.cells.cell_pool import NEVER, CellPool, CellTimes
 from stereovox.maps.cells.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.query import queries
 from stereovox.maps.query.queries import INDEX_LIMIT
-from stereovox.maps.record.frame_agreement import Agreement, agreement
+from stereovox.maps.record.glance import Agreement, agreement
 from stereovox.maps.record.history import History, WithHistory
 from stereovox.maps.record.kept_frames import KeptFrames
 from stereovox.maps.storage.blocks import CELLS, SIDE, StoredCells, blocks_of_cells

@@ -11,11 +11,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate import decision_words as words
-from stereovox.evaluate.outcomes import Outcomes
+from stereovox.evaluate import decisions as words
+from stereovox.evaluate.decisions import Outcomes
 from stereovox.evaluate.scores import Scores
-from stereovox.view.evaluation import curves_png, series_png
-from stereovox.view.outcomes import outcomes_png
+from stereovox.view.evaluation import curves_png, outcomes_png, series_png
 from stereovox.view.report import page
 
 TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")

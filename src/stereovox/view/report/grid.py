@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.evaluate.grids.grid_lattice import AlignedGrids
-from stereovox.evaluate.grids.grid_scores import GridScores
-from stereovox.view.grid_difference import binary_png, difference_png, side_by_side_png
+from stereovox.evaluate.grid_align import AlignedGrids
+from stereovox.evaluate.grid_scores import GridScores
+from stereovox.view.grid import binary_png, difference_png, side_by_side_png
 from stereovox.view.report import page
 
 LEAD = (

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Building blocks of a report, a self-contained HTML page. All text is escaped here."""
+"""Building blocks of a report, a self-contained HTML page. All text is escaped here.
+
+Folder of the option `--out`.
+"""
 
 from __future__ import annotations
 
@@ -77,3 +80,15 @@ def figure(png: bytes, alt: str) -> str:
 def code(text: str) -> str:
     """Return preformatted text."""
     return f"<pre>{escape(text)}</pre>"
+
+
+def out_folder(out: str | Path) -> Path:
+    """Return the folder `out`, created if missing; raises StereovoxError, one line, if that fails."""
+    check_local(out)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: a character 0
+        reason = getattr(error, "strerror", None) or error
+        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({reason}); choose another --out") from None
+    return folder

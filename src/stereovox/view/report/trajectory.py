@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from stereovox.evaluate.trajectory.trajectory_motions import ErrorFigures
-from stereovox.evaluate.trajectory.trajectory_score import TrajectoryScore
+from stereovox.evaluate.trajectory_score import ErrorFigures, TrajectoryScore
 from stereovox.view.report import page
 from stereovox.view.trajectory import trajectory_png
 

@@ -12,18 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config
-from stereovox.evaluate.cells import Keys, keys, occupied_cells, position, within
-from stereovox.evaluate.sightings import Sightings
-from stereovox.evaluate.truth import touched_cells
+from stereovox.evaluate.truth import Keys, keys, occupied_cells, position, touched_cells, within
+from stereovox.evaluate.truth_cells import Sightings
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
-from stereovox.products.floor.slices import layer
+from stereovox.products.floor_axes import layer
 from stereovox.simulate.scene import Scene, Solid
 from stereovox.simulate.simulation import SIMPLE, Simulation
 from stereovox.simulate.stage import Face
-from stereovox.view.figures import labels
-from stereovox.view.panels import GREY, STATE_COLOURS, title
+from stereovox.view.figures import GREY, STATE_COLOURS, labels, title
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown, percent
 from stereovox_lab.papers.pictures import SECOND, cut, figure_of, png
 

@@ -17,22 +17,20 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.correct.close_loops import close
 from stereovox.errors import FrameRefused
-from stereovox.evaluate.cells import keys
-from stereovox.evaluate.sightings import Sightings
-from stereovox.evaluate.truth import touched_cells
+from stereovox.evaluate.truth import keys, touched_cells
+from stereovox.evaluate.truth_cells import Sightings
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.opening import open_depth
-from stereovox.products.floor.slices import layer
+from stereovox.products.floor_axes import layer
 from stereovox.simulate.recorder import MOUNT, Recording, record
 from stereovox.simulate.scene import Solid
 from stereovox.simulate.simulation import Simulation
 from stereovox.simulate.stage import Stage
 from stereovox.simulate.t265 import T265
 from stereovox.sources.rigs.pair import CameraPair
-from stereovox.view.figures import labels
-from stereovox.view.panels import GREY, INK, PATH_COLOUR, measured, title
+from stereovox.view.figures import GREY, INK, PATH_COLOUR, labels, measured, title
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown, percent
 from stereovox_lab.papers.chien.rooms import RoomsFound, measure_rooms
 from stereovox_lab.papers.pictures import OURS, SECOND, cut, figure_of, png

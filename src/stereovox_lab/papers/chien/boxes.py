@@ -15,16 +15,13 @@ from stereovox.config import Config, load_config
 from stereovox.depth import prepare
 from stereovox.integrate import make_integrator
 from stereovox.maps import State, VoxelMap, make_map
-from stereovox.products.floor.slices import layer
+from stereovox.products.floor_axes import layer
 from stereovox.simulate.d435 import CAMERA
 from stereovox.simulate.scenes.plain_scenes import SIZES
 from stereovox.simulate.simulation import OWN, SIMPLE, Simulation
-from stereovox.view.figures import labels
-from stereovox.view.panels import INK, PATH_COLOUR, title
-from stereovox.view.scene.axis import draw_profile
-from stereovox.view.scene.landscape import draw_landscape
-from stereovox.view.scene.layer import draw_plan
-from stereovox.view.scene.space import draw_space
+from stereovox.view.figures import INK, PATH_COLOUR, labels, title
+from stereovox.view.layer import draw_landscape, draw_plan, draw_profile
+from stereovox.view.space import draw_space
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown
 from stereovox_lab.papers.pictures import figure_of, png
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.metrics import summarise
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.sources.base import Stream

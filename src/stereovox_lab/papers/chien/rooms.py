@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, keys, occupied_cells
-from stereovox.evaluate.truth import touched_cells
+from stereovox.evaluate.truth import Keys, keys, occupied_cells, touched_cells
 from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import Solid
 from stereovox.simulate.scenes.apartment import ROOMS

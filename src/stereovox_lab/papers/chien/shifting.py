@@ -17,8 +17,7 @@ from stereovox.integrate import make_integrator
 from stereovox.maps.storage.rolling import RollingMap
 from stereovox.maps.storage.tiles import TILE
 from stereovox.simulate.simulation import Simulation
-from stereovox.view.figures import labels
-from stereovox.view.panels import INK, PATH_COLOUR, title
+from stereovox.view.figures import INK, PATH_COLOUR, labels, title
 from stereovox_lab.papers.chapter import Chapter, Claim, Shown
 from stereovox_lab.papers.pictures import OURS, SECOND, THESIS, figure_of, png
 

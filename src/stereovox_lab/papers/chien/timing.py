@@ -17,14 +17,14 @@ import numpy as np
 from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.prepare import downsample
-from stereovox.evaluate.summary import percentiles
+from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import DepthImage, Frame
 from stereovox.integrate import make_integrator
 from stereovox.mapper import Mapper
 from stereovox.maps import make_map
 from stereovox.simulate.simulation import Simulation
 from stereovox.view.figures import labels
-from stereovox.view.scene.plain import colour_depth, plan_pixels, space_pixels
+from stereovox.view.plain import colour_depth, plan_pixels, space_pixels
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown
 from stereovox_lab.papers.pictures import OURS, THESIS, figure_of, png
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.evaluate.cells import Keys, indices, keys, occupied_cells
+from stereovox.evaluate.truth import Keys, indices, keys, occupied_cells
 from stereovox.frame import DepthImage
 from stereovox.geometry.se3 import Transform, inverse, transform_points
 from stereovox.integrate import make_integrator
@@ -22,7 +22,7 @@ from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import SIDE
 from stereovox.simulate.simulation import Simulation
-from stereovox.view.panels import measured, title
+from stereovox.view.figures import measured, title
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown, percent
 from stereovox_lab.papers.pictures import figure_of, png
 

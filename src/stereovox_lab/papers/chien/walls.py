@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, indices, keys, occupied_cells, position
+from stereovox.evaluate.truth import Keys, indices, keys, occupied_cells, position
 from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import Solid
 

@@ -15,7 +15,7 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.scan import scan_of
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import score_grids
 from stereovox.frame import Frame, Scan
 from stereovox.mapper import GridMapper
 from stereovox.maps import State

@@ -320,7 +320,7 @@ MUTANTS = (
     _setting(IST, "depth.denoise", True, "III-C"),
     _setting(IST, "noise.subpixel", 0.25, TABLE, UNUSED),
     _setting(IST, "noise.default_baseline", 0.1, TABLE, UNUSED),
-    Mutant(IST, "Eq 7 over all cells", "stereovox.evaluate.grids.grid_scores:cell_errors", _of_all_cells, "Eq 7"),
-    Mutant(IST, "Eq 7 without cells that one map alone knows", "stereovox.evaluate.grids.grid_scores:cell_errors",
+    Mutant(IST, "Eq 7 over all cells", "stereovox.evaluate.grid_scores:cell_errors", _of_all_cells, "Eq 7"),
+    Mutant(IST, "Eq 7 without cells that one map alone knows", "stereovox.evaluate.grid_scores:cell_errors",
            _contradiction_only, "Eq 7"),
 )  # fmt: skip

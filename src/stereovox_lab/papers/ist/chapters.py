@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stereovox.evaluate.grids.grid_scores import GridScores
+from stereovox.evaluate.grid_scores import GridScores
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.view.grid import draw_grid, plan
-from stereovox.view.grid_difference import binary_png, difference_png
-from stereovox.view.panels import title
+from stereovox.view.figures import title
+from stereovox.view.grid import binary_png, difference_png, draw_grid, plan
 from stereovox_lab.papers.chapter import Chapter, Claim, Sheet, Shown
 from stereovox_lab.papers.ist.claims import claims_of, eq7, fan_claims, numbers_of, update_ms
 from stereovox_lab.papers.ist.drives import Place

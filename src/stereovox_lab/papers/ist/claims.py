@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from stereovox.evaluate.grids.grid_lattice import three_states
-from stereovox.evaluate.grids.grid_scores import GridScores
+from stereovox.evaluate.grid_align import three_states
+from stereovox.evaluate.grid_scores import GridScores
 from stereovox.maps import State
 from stereovox_lab.papers.chapter import Claim
 from stereovox_lab.papers.ist.drives import Place

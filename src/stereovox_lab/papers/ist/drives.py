@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.evaluate.grids.grid_lattice import Rectangle
+from stereovox.evaluate.grid_align import Rectangle
 from stereovox.geometry import se2
 from stereovox.opening import open_robot
 from stereovox.simulate.floors.bag import TRUTH, write_bag

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.evaluate.summary import percentiles
+from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import Scan
 from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid

@@ -12,9 +12,9 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grids.grid_lattice import AlignedGrids, Rectangle
-from stereovox.evaluate.grids.grid_scores import GridScores, laid_on, score_laid
-from stereovox.evaluate.trajectory.trajectory import TrajectoryError, trajectory_error
+from stereovox.evaluate.grid_align import AlignedGrids, Rectangle
+from stereovox.evaluate.grid_scores import GridScores, laid_on, score_laid
+from stereovox.evaluate.trajectory import TrajectoryError, trajectory_error
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import localise

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from stereovox.config import Config, load_config
-from stereovox.evaluate.summary import summarise
+from stereovox.evaluate.metrics import summarise
 from stereovox.frame import Frame, UpdateReport
 from stereovox.geometry import se2
 from stereovox.localize.track import Track
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.floor.projection import project
+from stereovox.products.projection import project
 from stereovox_lab.papers.ist.drives import Recording
 
 REACH = 5.0

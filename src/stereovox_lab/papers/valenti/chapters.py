@@ -11,10 +11,8 @@ import numpy as np
 
 from stereovox.evaluate.curves import TOLERANT
 from stereovox.evaluate.scores import Scores
-from stereovox.view.evaluation import curves_png, series_png
-from stereovox.view.figures import labels
-from stereovox.view.outcomes import outcomes_png
-from stereovox.view.panels import GREY
+from stereovox.view.evaluation import curves_png, outcomes_png, series_png
+from stereovox.view.figures import GREY, labels
 from stereovox_lab.papers.chapter import NO, UNJUDGED, YES, Chapter, Sheet, Shown
 from stereovox_lab.papers.pictures import OURS, SECOND, figure_of, png
 from stereovox_lab.papers.valenti.apart import Apart

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
+from stereovox.evaluate.decisions import Outcomes, outcomes
 from stereovox.evaluate.lidar_truth import FREE, lidar_truth
-from stereovox.evaluate.outcomes import Outcomes, outcomes
 from stereovox.evaluate.scores import QuickScores, Scores, score, score_reading
 from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.maps import VoxelMap

@@ -14,7 +14,7 @@ import numpy as np
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused, MissingExtra
-from stereovox.evaluate.cells import indices, keys
+from stereovox.evaluate.truth import indices, keys
 from stereovox.formats.octomap import read_octomap
 from stereovox.frame import Frame, Reason
 from stereovox.geometry.se3 import transform_points

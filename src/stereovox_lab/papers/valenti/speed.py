@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from stereovox.config import Config
-from stereovox.evaluate.summary import percentiles
+from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import StereoFrame, UpdateReport
 from stereovox.mapper import Mapper
 from stereovox.sources.base import prefetch

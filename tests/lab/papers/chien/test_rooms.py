@@ -6,8 +6,7 @@ import pytest
 
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import indices, keys
-from stereovox.evaluate.truth import touched_cells
+from stereovox.evaluate.truth import indices, keys, touched_cells
 from stereovox.maps import VoxelMap
 from stereovox.simulate.recorder import OPENGL, follow
 from stereovox.simulate.scene import box

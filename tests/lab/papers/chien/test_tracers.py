@@ -5,7 +5,7 @@ import pytest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.evaluate.cells import keys
+from stereovox.evaluate.truth import keys
 from stereovox.frame import Frame
 from stereovox.integrate import make_integrator
 from stereovox.maps.cells.evidence import Evidence

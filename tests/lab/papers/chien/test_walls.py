@@ -6,7 +6,7 @@ import pytest
 
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import keys
+from stereovox.evaluate.truth import keys
 from stereovox.maps import VoxelMap
 from stereovox.simulate.scene import box, cylinder
 from stereovox_lab.papers.chien.walls import Wall, corner_deg, fit_plane, measure_wall, thickness_figures

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from stereovox.config import Config, WindowConfig
 from stereovox.errors import StereovoxError
 from stereovox.kernels.threads import Newest
-from stereovox.mapper import Mapper, UpdateReport
+from stereovox.frame import UpdateReport
+from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.storage.cubes import in_cubes
 from stereovox.viewer.frame import FramePanel, describe_frame

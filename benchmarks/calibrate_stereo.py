@@ -21,11 +21,10 @@ import cv2
 import numpy as np
 
 from stereovox.calibrate import stereo
-from stereovox.calibrate.chessboard import Board
-from stereovox.calibrate.stereo import BoardPair, calibrate_stereo, epipolar_errors
+from stereovox.calibrate.stereo import Board, BoardPair, calibrate_stereo, epipolar_errors
 from stereovox.calibrate.stereo_fit import FULL_MODEL_VIEWS, GUESSES, Corners, Fit, fit_stereo
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import Lens
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 

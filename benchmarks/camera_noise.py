@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 import stereovox as sv
 from stereovox.config import load_config
-from stereovox.depth.pipeline import DepthPipeline
+from stereovox.depth.prepare import DepthPipeline
 from stereovox.frame import Frame, Reason, StereoFrame
 from stereovox.geometry.se3 import inverse, transform_points
 

@@ -32,8 +32,7 @@ from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.localize.robot_track import slam_robot
 from stereovox.opening import open_robot
 from stereovox.runs.floor import map_floor
-from stereovox.simulate.floors.bag import write_bag
-from stereovox.simulate.floors.floor import Floor
+from stereovox.simulate.floors.floor import Floor, write_bag
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAYER = ROOT / "tests/helpers/play.py"

@@ -35,8 +35,8 @@ from obstacle_latency import listen
 from scipy.spatial.transform import Rotation
 
 import stereovox as sv
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import Lens
 from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.evaluate.metrics import percentiles
 from stereovox.frame import UpdateReport
@@ -44,7 +44,7 @@ from stereovox.geometry.se3 import Transform, inverse, rotation_vector
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import LiveRun
 from stereovox.maps.storage.storage import EVERYWHERE
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import photograph
 from stereovox.simulate.simulation import GREY_NOISE, Simulation
 from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu

@@ -347,7 +347,7 @@ def outputs() -> list[Mutation]:
         Mutation("diagnostics health", shown, "level=LEVELS[health.state]", "level=LEVELS['current']", CONTEXT),
         Mutation(
             "pose topics age",
-            "ros/poses/motion.py",
+            "ros/poses/location_topics.py",
             "if old := self._late(moved.stamp_ns):",
             "if old := None:",
             CONTEXT,

@@ -24,11 +24,11 @@ import numpy as np
 import psutil
 
 import stereovox as sv
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import Lens
 from stereovox.config import parse_value
 from stereovox.frame import AnyFrame
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import photograph
 from stereovox.simulate.simulation import Simulation
 
 HZ = 30

@@ -26,11 +26,10 @@ import psutil
 from numpy.typing import NDArray
 
 import stereovox as sv
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import Lens
 from stereovox.geometry.se3 import Transform, inverse, look_at
-from stereovox.simulate.d435 import D435, HFOV_DEG
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import D435, HFOV_DEG, photograph
 from stereovox.simulate.scene import Scene, Solid, box
 
 HZ = 15

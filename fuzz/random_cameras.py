@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 import stereovox as sv
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import CORRECTIONS, DepthCorrection
 from stereovox.cameras.rigs import Eyes, StereoPair, VirtualCamera
-from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
+from stereovox.cameras.wide import CylindricalCamera, Lens, SphericalCamera
 from stereovox.errors import StereovoxError
 
 BASELINES = (None, None, 0.05, 1e-6, 50.0)

@@ -204,7 +204,7 @@ def test_bare_files_are_found(tmp_path):
 
 def test_nothing_goes_by_a_clock_that_is_set():
     """Checkpoints, ages and deadlines would come early, late or never when somebody sets the system's time."""
-    measured = SOURCE / "frame/wall_clock.py"  # ages of images by their own stamps
+    measured = SOURCE / "frame/stamp_clock.py"  # ages of images by their own stamps
     for path in sorted({*SOURCE.rglob("*.py"), *LABORATORY.rglob("*.py")} - {measured}):
         text = path.read_text()
         suspect = re.search(r"^\s*(?:import|from)\b.*time", text, re.MULTILINE)  # most are not, and need no parsing

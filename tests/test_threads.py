@@ -28,11 +28,7 @@ from stereovox.maps.record.history import WithHistory
 from stereovox.maps.storage import cubes
 from stereovox.maps.storage.storage import OnStorage, Storage
 from stereovox.maps.voxel_map import OnBlocks
-from stereovox.products import difference, frontiers, ground, moved, path_check, projection
-from stereovox.products import edit as coarsen
-from stereovox.products import edit as crop
-from stereovox.products import edit as merge
-from stereovox.products import floor_axes as slices
+from stereovox.products import difference, edit, floor_axes, frontiers, ground, moved, path_check, projection
 from stereovox.products.projection import LiveProjection
 
 NO_EVIDENCE = Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.empty((0, 3), np.int32), 0)
@@ -178,15 +174,15 @@ def two():
 
 ALONE = {
     "bag": lambda m, path: bags.write_bag(m, path / "m.bag", (-9, 9)),
-    "coarsen": lambda m, path: coarsen.coarsen(m, 2),
-    "crop": lambda m, path: crop.crop(m, (-1, -1, -1), (1, 1, 1)),
+    "coarsen": lambda m, path: edit.coarsen(m, 2),
+    "crop": lambda m, path: edit.crop(m, (-1, -1, -1), (1, 1, 1)),
     "cubes": lambda m, path: cubes.in_cubes(m),
     "difference": lambda m, path: difference.difference(m, mapped().map),
     "frontiers": lambda m, path: frontiers.frontiers(m, 0.2),
     "ground": lambda m, path: ground.ground(m),
     "inflate": lambda m, path: projection.inflated(m, 0.3),
-    "layer": lambda m, path: slices.layer(m, "z", 0.0),
-    "merge": lambda m, path: merge.merge(m, mapped().map),
+    "layer": lambda m, path: floor_axes.layer(m, "z", 0.0),
+    "merge": lambda m, path: edit.merge(m, mapped().map),
     "mesh": lambda m, path: meshes.surface(m),
     "moved": lambda m, path: moved.moved(m, np.eye(4)),
     "octomap": lambda m, path: octomap.binary_tree(m),

@@ -65,11 +65,11 @@ if TYPE_CHECKING:
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
     from stereovox.maps.record.health import Health as Health
-    from stereovox.mavlink.directions import DirectionRules as DirectionRules
     from stereovox.mavlink.link import MavlinkLink as MavlinkLink
     from stereovox.mavlink.pose_sender import PoseSender as PoseSender
     from stereovox.mavlink.poses import PoseReceiver as PoseReceiver
     from stereovox.mavlink.poses import receive_poses as receive_poses
+    from stereovox.mavlink.sectors import DirectionRules as DirectionRules
     from stereovox.mavlink.sectors import SectorRules as SectorRules
     from stereovox.mavlink.sectors import obstacle_sectors as obstacle_sectors
     from stereovox.mavlink.sending import ObstacleSender as ObstacleSender
@@ -181,7 +181,7 @@ _HOMES = {
     "map_fleet": "fleet",
     "plan_fleet": "fleet",
     "score_fleet": "fleet",
-    "DirectionRules": "mavlink.directions",
+    "DirectionRules": "mavlink.sectors",
     "MavlinkLink": "mavlink.link",
     "PoseReceiver": "mavlink.poses",
     "receive_poses": "mavlink.poses",

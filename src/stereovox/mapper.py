@@ -14,15 +14,14 @@ from typing import Any, Protocol, TypeVar
 
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
+from stereovox.depth.cloud import level_range
 from stereovox.depth.quality import checked_scan
-from stereovox.depth.ranges import level_range
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Cloud, Frame, Range, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.frame.stamp_clock import StampsBy
 from stereovox.frame.validate import validate_upright_scan
-from stereovox.integrate.beams import make_beams
-from stereovox.integrate.cones import cone_evidence
+from stereovox.integrate.beams import cone_evidence, make_beams
 from stereovox.kernels.device import check_on_processor, on_usable_device
 from stereovox.kernels.threads import MapLock, uninterrupted
 from stereovox.mapping.comparison import Comparison

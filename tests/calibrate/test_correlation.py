@@ -4,9 +4,8 @@
 import numpy as np
 import pytest
 
-from stereovox.calibrate.correlation import LAGS, Correlation, add_products
 from stereovox.calibrate.noise import calibrate_noise, noise_at
-from stereovox.calibrate.recording import read_wall
+from stereovox.calibrate.surface import LAGS, Correlation, add_products, read_wall
 from stereovox.opening import open_source
 from stereovox.sensors.noise import kept_by_means, looks
 from stereovox.simulate.d435 import smooth_noise

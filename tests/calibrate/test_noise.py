@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.calibrate.noise import calibrate_noise, fit_noise, noise_at
-from stereovox.calibrate.recording import read_wall
+from stereovox.calibrate.surface import read_wall
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import StereovoxError

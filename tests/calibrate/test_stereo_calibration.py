@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 from made_boards import BOARD, fisheye_eyes, pinhole_eyes, poses, seen, write_boards
 
-from stereovox.calibrate.chessboard import Board, find_corners, image_pairs, same_order, unmatched
 from stereovox.calibrate.stereo import (
+    Board,
     BoardPair,
     calibrate_stereo,
     check_model,
     epipolar_errors,
     field_of_view,
+    find_corners,
+    image_pairs,
     read_boards,
+    same_order,
+    unmatched,
 )
 from stereovox.calibrate.stereo_fit import fit_stereo
 from stereovox.errors import StereovoxError

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.calibrate.recording import metres, read_wall
-from stereovox.calibrate.surface import find_wall, fit_plane, tilt_deg
+from stereovox.calibrate.surface import find_wall, fit_plane, metres, read_wall, tilt_deg
 from stereovox.calibrate.wall import (
     Points,
     calibrate_wall,

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereovox.cameras.lenses import Lens
+from stereovox.cameras.wide import Lens
 from stereovox.errors import StereovoxError
 
 NARROW = {

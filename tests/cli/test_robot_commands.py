@@ -10,7 +10,7 @@ import pytest
 from stereovox.cli import main
 from stereovox.cli.map.slam import _pace
 from stereovox.formats.map_server import read_map_server
-from stereovox.localize.slam.doubts import MapDoubt
+from stereovox.localize.slam.graph import MapDoubt
 from stereovox.opening import open_robot
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import read_pose

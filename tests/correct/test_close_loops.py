@@ -11,8 +11,8 @@ import stereovox as sv
 from stereovox.cli.correct.loops import say_closure
 from stereovox.correct.close_loops import close
 from stereovox.correct.loops.closer import Loop, LoopCloser
-from stereovox.correct.loops.matching import Match
-from stereovox.correct.loops.positions import Positions
+from stereovox.correct.loops.drift import Positions
+from stereovox.correct.loops.submaps import Match
 from stereovox.maps.record.camera_path import LoopLines
 from stereovox.products.moved import moved
 from stereovox.sources.poses.trajectory import Trajectory, write_trajectory

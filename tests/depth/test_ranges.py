@@ -10,12 +10,11 @@ import pytest
 from made_images import cells_of
 
 import stereovox as sv
-from stereovox.depth.cloud import checked_cloud
-from stereovox.depth.ranges import cloud_of, directions
+from stereovox.depth.cloud import checked_cloud, cloud_of, directions
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.integrate.points import Points
-from stereovox.sensors.arc import Arc
+from stereovox.sensors.models import Arc
 
 SMALL = {"voxel_size": 0.1, "max_range": 5.0}
 SONAR = sv.RangeSensor(beam=radians(30))

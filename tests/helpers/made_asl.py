@@ -10,8 +10,8 @@ import numpy as np
 from made_recordings import write_png
 from made_rigs import FORWARD, eyes, picture
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import Lens
 
 START = 1_520_530_308_199_447_626
 STEP = 50_000_000

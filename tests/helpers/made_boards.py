@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereovox.calibrate.chessboard import Board
-from stereovox.cameras.lenses import Lens
+from stereovox.calibrate.stereo import Board
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import Lens
 from stereovox.geometry.se3 import Transform, inverse, rotation_matrix
 
 BOARD = Board(7, 5, 0.04)

@@ -10,8 +10,7 @@ from stereovox.config import load_config
 from stereovox.formats.map_server import write_map_server
 from stereovox.localize.robot_track import slam_robot
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.simulate.floors.bag import write_bag
-from stereovox.simulate.floors.floor import Floor
+from stereovox.simulate.floors.floor import Floor, write_bag
 
 SCAN, DEPTH = "/scan", "/camera/depth/image_raw"
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
+from stereovox.cameras.wide import Lens
 from stereovox.frame import StereoFrame
 from stereovox.geometry.se3 import Transform, look_at
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import photograph
 from stereovox.simulate.scene import Point, Scene, box
 
 BASELINE = 0.12

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from made_recordings import write_png
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes
-from stereovox.cameras.wide import CylindricalCamera
+from stereovox.cameras.wide import CylindricalCamera, Lens
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.sources.rigs.rig_file import Rig, RigPair, Virtual, write_rig
 

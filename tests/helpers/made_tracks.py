@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import Lens
 from stereovox.frame import AnyFrame, Frame, Photo
 from stereovox.geometry.se3 import Transform, inverse, look_at, rotation_vector
-from stereovox.simulate.d435 import D435, depth_camera
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import D435, depth_camera, photograph
 from stereovox.simulate.scene import Point, Scene, box
 from stereovox.simulate.simulation import Simulation
 from stereovox.track.tracker import Tracked, Tracker

@@ -18,8 +18,8 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.frame import CheckedCloud, DepthImage
-from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
+from stereovox.sensors.protocol import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
 
 WINDOW_SHARE, RIM_SHARE, NEAR_PLANE, MAX_LEVEL = 0.27, 0.35, 1e-3, 8
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import Lens
+from stereovox.cameras.wide import Lens
 
 Cell = tuple[int, int, int]
 Vector = NDArray[np.float64]

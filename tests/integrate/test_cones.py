@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.depth.ranges import level_range
+from stereovox.depth.cloud import level_range
 from stereovox.frame import Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.integrate.cones import cone_evidence
+from stereovox.integrate.beams import cone_evidence
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import load_grid
 

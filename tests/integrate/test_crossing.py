@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stereovox.errors import StereovoxError
-from stereovox.integrate import crossing
-from stereovox.integrate.crossing import crossed_cells, scan_evidence
+from stereovox.integrate import points
+from stereovox.integrate.points import crossed_cells, scan_evidence
 
 
 def slowly_crossed(start: np.ndarray, stop: np.ndarray) -> set[tuple[int, ...]]:
@@ -46,7 +46,7 @@ def test_no_rays_cross_no_cells():
 def test_pieces_change_nothing(monkeypatch):
     ends = np.random.default_rng(3).uniform(-9, 9, (200, 3))
     whole = crossed_cells(np.zeros(3), ends, 0.3)
-    monkeypatch.setattr(crossing, "AT_ONCE", 100)
+    monkeypatch.setattr(points, "AT_ONCE", 100)
     np.testing.assert_array_equal(crossed_cells(np.zeros(3), ends, 0.3), whole)
 
 

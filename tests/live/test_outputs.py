@@ -17,14 +17,13 @@ from stereovox.depth.sphere import T_BODY_OPTICAL
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Frame, Photo, UpdateReport
-from stereovox.frame.wall_clock import epoch_ns
-from stereovox.live.latency import Latency
-from stereovox.live.outputs import GridFile, LiveSphere
+from stereovox.frame.stamp_clock import epoch_ns
+from stereovox.live.outputs import GridFile, Latency, LiveSphere
 from stereovox.live.recorder import WAITING, Recorder, optical, topic
 from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.opening import open_source
-from stereovox.products import projection as live_projection
+from stereovox.products import projection
 from stereovox.simulate.simulation import Simulation
 from stereovox.sources.bags.writer import BagWriter
 
@@ -75,13 +74,13 @@ def test_nothing_is_written_of_a_map_that_no_second_frame_has_confirmed(tmp_path
 @pytest.mark.parametrize("off_m", [0.0, -1.0, 1.0])
 def test_what_stands_on_the_true_floor_is_not_free_in_the_written_2d_map(tmp_path, monkeypatch, off_m):
     """The camera begins 1.3 m above the floor, at z = 0. A floor that is 1 m off fails the same test."""
-    simulation, find = Simulation("sim:room?image_width=96", frames=80), live_projection.find_floor
+    simulation, find = Simulation("sim:room?image_width=96", frames=80), projection.find_floor
 
     def wrong(voxel_map):
         floor = find(voxel_map)
         return replace(floor, height=floor.height + np.float32(off_m))
 
-    monkeypatch.setattr(live_projection, "find_floor", wrong)
+    monkeypatch.setattr(projection, "find_floor", wrong)
     origin = simulation.true_pose(0)[:3, 3].copy()
     mapper = Mapper(voxel_size=0.1)
     grid = GridFile(mapper, tmp_path / "g.yaml", period_s=0.0)

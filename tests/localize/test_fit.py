@@ -6,7 +6,7 @@ import pytest
 
 from stereovox.frame import Scan
 from stereovox.geometry import se2
-from stereovox.localize.fit import fit_share
+from stereovox.localize.robot_track import fit_share
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
 

@@ -8,7 +8,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.frame.validate import validate_scan
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.localize.scan_beams import beams_of
+from stereovox.localize.track import beams_of
 
 MANY = np.array([np.nan, -np.inf, 0.01, 0.0, -1.0, 1.0, 2.0, 4.0, 5.0, np.inf], np.float32)
 

@@ -11,7 +11,7 @@ from stereovox.config import load_config
 from stereovox.depth import DepthPipeline
 from stereovox.frame import CheckedCloud
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.mapping.frozen import CHECKED, FEW, STEP, FrozenViews, is_frozen, jumped, moved_on, with_glance
+from stereovox.mapping.gate import CHECKED, FEW, STEP, FrozenViews, is_frozen, jumped, moved_on, with_glance
 from stereovox.maps.record.glance import binned
 from stereovox.maps.record.history import MAX_GLANCES, StampedPose
 from stereovox_lab.checks.bad_images import metres

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereovox.mavlink.clock import ENOUGH, RemoteClock
+from stereovox.mavlink.link import ENOUGH, RemoteClock
 
 AHEAD_NS = 5_000_000_000_000
 MS = 1_000_000

@@ -6,7 +6,7 @@ from made_halls import CELL, hall, looking
 
 from stereovox import State, StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.mavlink.directions import DirectionRules, nearest_places
+from stereovox.mavlink.sectors import DirectionRules, nearest_places
 
 POST = ((2, -0.1, -0.3), (2.2, 0.1, 0.3))
 

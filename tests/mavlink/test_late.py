@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.mavlink.body import Body, BodyPose
 from stereovox.mavlink.link import dialect
+from stereovox.mavlink.pose_sender import Body, BodyPose
 from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
 from stereovox_lab.flights.late import Delay, LateLoop, LateSetup, fly_late
 

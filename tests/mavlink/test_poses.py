@@ -84,7 +84,7 @@ class QuietLink:
     url = "test"
 
     def __init__(self, now_ns=10**12):
-        from stereovox.mavlink.clock import RemoteClock
+        from stereovox.mavlink.link import RemoteClock
 
         self.clock, self.handlers, self.now = RemoteClock(), [], now_ns
         self.clock.answered(now_ns, now_ns + 10**9, now_ns)
@@ -148,7 +148,7 @@ def test_poses_that_cannot_be_trusted_are_passed_over_and_told_once(quiet, messa
 
 
 def test_nothing_is_taken_before_the_clock_is_known(quiet):
-    from stereovox.mavlink.clock import RemoteClock
+    from stereovox.mavlink.link import RemoteClock
 
     link, taken, _told, receiver = quiet
     link.clock = RemoteClock()

@@ -7,9 +7,8 @@ import pytest
 
 from stereovox import Cloud, Mapper, MapRun, ObstacleSender, Range, StereovoxError, open_source
 from stereovox.geometry.se3 import inverse
-from stereovox.mavlink.directions import DirectionRules
 from stereovox.mavlink.link import MavlinkLink
-from stereovox.mavlink.sectors import SectorRules, obstacle_sectors
+from stereovox.mavlink.sectors import DirectionRules, SectorRules, obstacle_sectors
 from stereovox.mavlink.sending import HIGHEST_RATE_HZ
 
 RULES = SectorRules(max_distance=4.0)

@@ -10,7 +10,7 @@ from stereovox.geometry.se3 import rotation_vector
 from stereovox.live.poses import open_poses
 from stereovox.live.rig import LiveCamera, mount_of
 from stereovox.live.run import map_live
-from stereovox.mavlink.stream import MavlinkPoses
+from stereovox.mavlink.poses import MavlinkPoses
 from stereovox.sources.poses.live_poses import LivePoses
 
 SMALL = {"voxel_size": 0.1, "max_range": 4.0}

@@ -20,9 +20,9 @@ from stereovox.live import outputs as live_outputs
 from stereovox.live.outputs import GridFile, LiveSphere
 from stereovox.maps import State
 from stereovox.maps.record import health
-from stereovox.mavlink import directions, sectors
-from stereovox.mavlink.body import Body
+from stereovox.mavlink import sectors
 from stereovox.mavlink.link import dialect
+from stereovox.mavlink.pose_sender import Body
 from stereovox.products import projection
 from stereovox.products.context import OUTPUTS, context_of
 from stereovox.products.projection import project
@@ -187,7 +187,7 @@ def diagnostics_say(figure):
 
 
 def odometry_is_silent():
-    from stereovox.ros.poses.motion import MotionPublisher
+    from stereovox.ros.poses.location_topics import MotionPublisher
 
     sent = []
     publisher = MotionPublisher(node(sent, []), False, lambda stamp_ns: "old")
@@ -387,7 +387,7 @@ def test_a_context_says_what_the_mapper_knows():
 
 def test_directions_end_at_the_unknown():
     world = World(frames=1)
-    assert len(directions.nearest_places(world.mapper.map, moved(world, 0.0))) == 40
+    assert len(sectors.nearest_places(world.mapper.map, moved(world, 0.0))) == 40
 
 
 WORDS = {

@@ -5,7 +5,7 @@ from threading import Event
 
 import pytest
 
-from stereovox.ros.background import Background
+from stereovox.ros.library import Background
 
 
 @pytest.fixture

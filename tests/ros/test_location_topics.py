@@ -15,10 +15,10 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.grid_scores import score_grids
 from stereovox.ros.mapping import Mapping
+from stereovox.ros.obstacles import Score
 from stereovox.ros.options import Options
 from stereovox.ros.poses import location_topics as topics
 from stereovox.ros.poses.localization import LocalizedPoses, Localizer, Located, MapLocalization
-from stereovox.ros.score import Score
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import read_transforms
 
@@ -67,7 +67,7 @@ def test_pose_and_particles_have_the_fields_of_ros():
 
 @pytest.fixture
 def out(monkeypatch):
-    monkeypatch.setattr("stereovox.ros.poses.motion.tf_message", lambda: SimpleNamespace)
+    monkeypatch.setattr("stereovox.ros.poses.location_topics.tf_message", lambda: SimpleNamespace)
     node, poses = Node(), LocalizedPoses("map", "", 0.1, "odom")
     return node, poses, topics.LocationTopics(node, poses, Options(tf_tolerance_s=0.25))
 

@@ -15,8 +15,8 @@ from stereovox.formats.map_server import write_map_server
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.products.projection import project
 from stereovox.ros.mapping import Mapping
+from stereovox.ros.obstacles import score_of
 from stereovox.ros.options import Options
-from stereovox.ros.score import score_of
 
 STANDS = {"scan.floor": 0.0, "scan.heights": [0.1, 0.6]}
 """The walk's images show no floor: its world stands on it."""
@@ -70,7 +70,7 @@ def said_by_loading(path):
 def said_by_scoring(path):
     said = []
     node = SimpleNamespace(get_logger=lambda: SimpleNamespace(warning=said.append))
-    with patch("stereovox.ros.score.Score"):
+    with patch("stereovox.ros.obstacles.Score"):
         score_of(node, None, Options(reference=path))
     return said
 

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
 
-from stereovox.ros.poses import motion
+from stereovox.ros.poses import location_topics
 from stereovox.ros.poses.tracking import Moved
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.robot_messages import read_transforms
@@ -47,7 +47,7 @@ def numbers(place, turn) -> list[float]:
 
 
 def test_odometry_has_the_order_of_ros_and_no_speed():
-    message = motion.odometry_message(moved())
+    message = location_topics.odometry_message(moved())
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (7, 9)
     pose = message.pose.pose
@@ -60,12 +60,12 @@ def test_odometry_has_the_order_of_ros_and_no_speed():
 @pytest.fixture
 def with_tf2(monkeypatch):
     """A class of messages is there; what is published are bytes."""
-    monkeypatch.setattr(motion, "tf_message", lambda: SimpleNamespace)
+    monkeypatch.setattr(location_topics, "tf_message", lambda: SimpleNamespace)
 
 
 def test_the_transform_is_that_of_the_odometry(with_tf2):
     node = Node()
-    motion.MotionPublisher(node, with_tf=True).publish(moved())
+    location_topics.MotionPublisher(node, with_tf=True).publish(moved())
     (data,) = node.sent["/tf"]
     (one,) = read_transforms(Wire(data, cdr=True))
     pose = node.sent["tracked_odometry"][0].pose.pose
@@ -75,18 +75,18 @@ def test_the_transform_is_that_of_the_odometry(with_tf2):
 
 def test_a_transform_that_another_node_publishes_is_left_to_it(with_tf2):
     node = Node()
-    motion.MotionPublisher(node, with_tf=True).publish(moved("wheels"))
+    location_topics.MotionPublisher(node, with_tf=True).publish(moved("wheels"))
     assert node.sent["/tf"] == []
     assert len(node.sent["tracked_odometry"]) == 1
     assert "wheels -> base_link" in node.said[0]
 
 
 def test_without_tf2_msgs_or_where_it_is_not_wanted_there_is_odometry_alone(monkeypatch):
-    monkeypatch.setattr(motion, "tf_message", lambda: None)
+    monkeypatch.setattr(location_topics, "tf_message", lambda: None)
     node = Node()
-    motion.MotionPublisher(node, with_tf=True).publish(moved())
+    location_topics.MotionPublisher(node, with_tf=True).publish(moved())
     assert (list(node.sent), len(node.said)) == (["tracked_odometry"], 1)
-    monkeypatch.setattr(motion, "tf_message", lambda: SimpleNamespace)
+    monkeypatch.setattr(location_topics, "tf_message", lambda: SimpleNamespace)
     node = Node()
-    motion.MotionPublisher(node, with_tf=False).publish(moved())
+    location_topics.MotionPublisher(node, with_tf=False).publish(moved())
     assert (list(node.sent), node.said) == (["tracked_odometry"], [])

@@ -16,7 +16,7 @@ from stereovox.cli import main
 from stereovox.cli.robots.ros2 import add_arguments
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.ros import map_server, obstacles, outputs, score
+from stereovox.ros import obstacles, outputs
 from stereovox.ros.nav2 import laid_over, overlay, write_nav2
 from stereovox.ros.options import PREFIX, Options, with_parameters
 from stereovox.ros.poses import location_topics
@@ -24,8 +24,8 @@ from stereovox.ros.poses import location_topics
 TOPICS = {
     f"/{name}"
     for name in (
-        outputs.MAP, outputs.CLOUD, obstacles.OBSTACLES, obstacles.FREE_RAYS, map_server.MAP, location_topics.POSE,
-        location_topics.PARTICLES, location_topics.INITIAL, score.TOPIC, "diagnostics",
+        outputs.MAP, outputs.CLOUD, obstacles.OBSTACLES, obstacles.FREE_RAYS, outputs.MAP_TOPIC,
+        location_topics.POSE, location_topics.PARTICLES, location_topics.INITIAL, obstacles.TOPIC, "diagnostics",
     )
 }  # fmt: skip
 OTHERS = {"/goal_pose", "/clicked_point"}

@@ -8,8 +8,8 @@ from stereovox.config import NoiseConfig, SensorConfig
 from stereovox.errors import ConfigError
 from stereovox.integrate.views import kernel_table
 from stereovox.sensors import SENSORS, make_sensor
-from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, offset_sigma, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
+from stereovox.sensors.protocol import COLUMNS, REACH_SIGMA, ROWS, offset_sigma, tabulate
 
 CASES = [(0.5, 0.002), (2.0, 0.01), (4.0, 0.08), (8.0, 0.3)]
 HALF = np.sqrt(2 * np.log(2))

@@ -7,8 +7,8 @@ import pytest
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.config import NoiseConfig, SensorConfig
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import offset_sigma, tabulate
 from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.protocol import offset_sigma, tabulate
 
 FIGURE = SphericalCamera(1201, 3, 2.5 / 1200, 2.5 / 1200, 600.0, 1.0, 0.1)
 """The camera of Valenti 2018, Fig 6.2; k = 0.75, p_unknown = 0.5, p_free = 0.3 are the model's defaults."""

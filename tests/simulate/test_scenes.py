@@ -5,7 +5,7 @@ import pytest
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import inverse, rigidity_error, transform_points
 from stereovox.opening import open_source
-from stereovox.simulate.scenes import plain_scenes, town
+from stereovox.simulate.scenes import hall, town
 from stereovox.simulate.simulation import SCENES, Simulation
 from stereovox.simulate.stage import Stage, rectangle
 
@@ -45,7 +45,7 @@ def test_other_scenes_can_be_registered(monkeypatch):
 
 def my_wall(*, away: float = 1.0) -> Stage:
     """Return a wall, by the function of the built-in one."""
-    return plain_scenes.wall_stage(distance=away)
+    return hall.wall_stage(distance=away)
 
 
 @pytest.mark.parametrize("scene", SCENES)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from stereovox.simulate.scene import box, cylinder
-from stereovox.simulate.triangle_tree import TriangleTree
+from stereovox.simulate.scene import TriangleTree, box, cylinder
 
 NOTHING = np.zeros(3)
 
@@ -136,7 +135,7 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_on_threads():
 PLAIN = """
 import sys
 import numpy as np
-from stereovox.simulate.triangle_tree import TriangleTree
+from stereovox.simulate.scene import TriangleTree
 given = np.load(sys.argv[1])
 np.savez(sys.argv[2], *TriangleTree(given["triangles"]).nearest(np.array([0.3, 0.1, -0.2]), given["directions"]))
 """

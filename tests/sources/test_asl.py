@@ -10,8 +10,8 @@ from made_asl import START, STEP, asl, matrix_text, poses_csv
 from made_recordings import write_png
 from made_rigs import FORWARD, eyes, picture, poses_text
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes, StereoPair
+from stereovox.cameras.wide import Lens
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import inverse
 from stereovox.opening import open_source

@@ -8,8 +8,8 @@ import pytest
 from made_asl import sensor_text
 from made_rigs import FORWARD
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import Lens
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.sources.calibration.calibration_files import import_rig

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes, StereoPair
+from stereovox.cameras.wide import Lens
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.sources.calibration.calibration_files import import_rig

@@ -17,7 +17,7 @@ from made_recordings import chunk, tum
 from made_rigs import recorded
 from made_robot_bags import START_NS, Messages, RobotBagMaker
 
-from stereovox.calibrate.chessboard import read_grey
+from stereovox.calibrate.stereo import read_grey
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.evaluate.inputs import read_camera_path
 from stereovox.evaluate.trajectory import read_relations

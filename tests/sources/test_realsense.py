@@ -173,7 +173,7 @@ def test_a_calibration_of_a_live_camera_ends_where_frames_names_no_end(camera, m
     monkeypatch.setattr(recordings, "LIVE_FRAMES", 5)
     for frames, count in ((None, 5), ("1:", 5), (":3", 3)):
         seen = []
-        monkeypatch.setattr("stereovox.calibrate.recording.read_wall", lambda shown, *_: seen.extend(shown))  # noqa: B023
+        monkeypatch.setattr("stereovox.calibrate.surface.read_wall", lambda shown, *_: seen.extend(shown))  # noqa: B023
         with camera.sending():
             recordings.read_walls([STILL], [], frames)
         assert len(seen) == count

@@ -6,7 +6,7 @@ import pytest
 from made_recordings import write_png
 from made_rigs import CAMERA, FORWARD, picture, poses_text, recorded, rig
 
-from stereovox.depth.stereo.rectify import rectified
+from stereovox.depth.stereo.pipeline import rectified
 from stereovox.errors import SourceError
 from stereovox.frame import StereoFrame
 from stereovox.opening import open_source

@@ -9,8 +9,7 @@ import pytest
 from made_recordings import write_png
 
 from stereovox.config import load_config
-from stereovox.depth.stereo.pipeline import StereoDepth
-from stereovox.depth.stereo.rectify import rectified
+from stereovox.depth.stereo.pipeline import StereoDepth, rectified
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
 from stereovox.sources.rigs.two_view import TwoView

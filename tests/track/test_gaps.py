@@ -4,7 +4,7 @@ from dataclasses import replace
 from made_unposed import room
 
 from stereovox.frame import UpdateReport
-from stereovox.track.gaps import LostSpans, TrackingGap
+from stereovox.track.stream import LostSpans, TrackingGap
 
 
 def spans(words, number=0):

@@ -10,8 +10,7 @@ from made_unposed import room
 
 from stereovox.config import load_config
 from stereovox.geometry.se3 import inverse, rotation_matrix
-from stereovox.track.guided import GuidedTracker
-from stereovox.track.stream import LOST, follow
+from stereovox.track.stream import LOST, GuidedTracker, follow
 from stereovox.track.tracker import Tracker
 
 NOWHERE = np.full((4, 4), np.nan)

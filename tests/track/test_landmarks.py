@@ -12,7 +12,7 @@ from made_tracks import simulated, track
 
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
-from stereovox.track.pairs import DISPARITY
+from stereovox.track.landmarks import DISPARITY
 from stereovox.track.sightings import ALIKE, PIXEL, Corners, Sightings
 from stereovox.track.tracker import Tracker
 

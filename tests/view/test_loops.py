@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 import stereovox as sv
 from stereovox.correct.close_loops import LoopClosure
 from stereovox.correct.loops.closer import Loop
-from stereovox.correct.loops.matching import Match
+from stereovox.correct.loops.submaps import Match
 from stereovox.errors import StereovoxError
 from stereovox.mapping.rebuild import CORRECTED, CorrectionReport
 from stereovox.view.loops import AFTER, BEFORE, CLOSED, LISTED, REFUSED, WINDOW_M, loops_figure, loops_picture

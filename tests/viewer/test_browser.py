@@ -13,7 +13,7 @@ import pytest
 import stereovox as sv
 from stereovox.frame import Viewpoint
 from stereovox.maps import State
-from stereovox.viewer.replay import Replay
+from stereovox.viewer.frame import Replay
 from stereovox.viewer.viewer import open_viewer
 
 SWITCHES = (

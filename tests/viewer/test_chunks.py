@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stereovox.viewer.chunks import MAX_CELLS, SIDE, Chunks, coarser, levels, split
+from stereovox.viewer.cells import MAX_CELLS, SIDE, Chunks, coarser, levels, split
 
 SIZE = 0.1
 random = np.random.default_rng(1)

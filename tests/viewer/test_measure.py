@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 
 from stereovox import VoxelMap, load_config
-from stereovox.viewer.measure import FIRST, HOW, first_hit
+from stereovox.viewer.panel import FIRST, HOW, first_hit
 from stereovox.viewer.viewer import open_viewer
 
 SIZE = 0.2

@@ -13,9 +13,8 @@ import pytest
 import stereovox as sv
 from stereovox.depth.cloud import checked_cloud
 from stereovox.frame import Reason
-from stereovox.viewer.frame import MAX_WIDTH_PX, REASON_COLOURS, cloud_picture, depth_picture, describe_frame
+from stereovox.viewer.frame import MAX_WIDTH_PX, REASON_COLOURS, Replay, cloud_picture, depth_picture, describe_frame
 from stereovox.viewer.live import LiveView
-from stereovox.viewer.replay import Replay
 from stereovox.viewer.viewer import open_viewer
 
 SETTINGS = {"voxel_size": 0.1, "max_range": 4.0}

@@ -17,8 +17,7 @@ from stereovox.maps.record.camera_path import LoopLines
 from stereovox.view.layer import scale_of
 from stereovox.viewer.cameras import first_look, up_vector
 from stereovox.viewer.cells import CORNERS, FACES, brightness, linear
-from stereovox.viewer.layer import MAX_PX, layer_colours, sharp
-from stereovox.viewer.panel import colour_bar, plain, statistics
+from stereovox.viewer.panel import MAX_PX, colour_bar, layer_colours, plain, sharp, statistics
 from stereovox.viewer.viewer import open_viewer
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 319.5, 239.5, 0.05)

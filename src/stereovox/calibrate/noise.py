@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.calibrate.correlation import Correlation
-from stereovox.calibrate.recording import WallRecording
-from stereovox.calibrate.surface import Array, find_wall, fit_plane, slopes
+from stereovox.calibrate.surface import Array, Correlation, WallRecording, find_wall, fit_plane, slopes
 from stereovox.calibrate.wall import distance_groups
 from stereovox.errors import StereovoxError
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import Lens
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 

@@ -3,17 +3,121 @@
 
 Seen from a pinhole camera a plane is linear in the slopes x = X/Z and y = Y/Z of the pixels: 1/z = a + b x + c y. So
 the wall, however it leans, has three parameters, and a distorted one is approximated by a quadratic.
+
+Correlation of the errors of neighbouring pixels, and the number of independent measurements in a patch. A recording of
+a flat wall by a camera at rest, reduced to a few sums per pixel.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from math import e, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.depth.prepare import correct
 from stereovox.errors import StereovoxError
+from stereovox.frame import AnyFrame, Frame, Reason, StereoFrame
+from stereovox.sensors.noise import kept_by_means
+
+LAGS = 16
+"""Pixels up to which errors are compared."""
+SHAPE_FROM = 12
+"""Correlation at this lag and beyond is due to the shape of the wall's image, not noise, and is subtracted."""
+LEAST = 0.05
+"""A correlation below this counts as zero and ends the sum."""
+INDEPENDENT = 1.02
+"""Sums up to this mean independent pixels."""
+WIDEST_PX = 8.0
+"""Largest standard deviation in pixels of the fitted Gaussian."""
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation of the errors of pixels 0 to LAGS apart.
+
+    rows, columns: along a row and along a column; 1 at lag 0.
+    """
+
+    rows: tuple[float, ...]
+    columns: tuple[float, ...]
+
+    @classmethod
+    def of(cls, products: NDArray[np.float64]) -> Correlation:
+        """Return the correlation from sums as `add_products` makes them; independent pixels if there are no errors."""
+        means = products[..., 0] / np.maximum(products[..., 1], 1)
+        if not (means[:, 0] > 0).all():
+            means = np.broadcast_to(np.arange(LAGS + 1) == 0, means.shape).astype(float)
+        means = means / means[:, :1]
+        shape = np.maximum(means[:, SHAPE_FROM:].mean(axis=1, keepdims=True), 0)
+        rows, columns = (means - shape) / np.maximum(1 - shape, 1e-6)
+        return cls(tuple(rows.tolist()), tuple(columns.tolist()))
+
+    @property
+    def length_px(self) -> float:
+        """Standard deviation in pixels of the Gaussian that, smoothing independent noise, makes large patches as noisy.
+
+        0: pixels are independent. For noise smoothed by it the correlation falls to 1/e at twice that.
+        """
+        share = sqrt(_sum(self.rows) * _sum(self.columns))
+        if share < INDEPENDENT:
+            return 0.0
+        widths = np.linspace(0, WIDEST_PX, 801)
+        return float(np.interp(share, [kept_by_means(width) for width in widths.tolist()], widths))
+
+    @property
+    def falls_to_1_e_px(self) -> tuple[float, float]:
+        """Pixels at which the correlation along rows and along columns falls to 1/e; LAGS if it does not."""
+        return _falls(self.rows), _falls(self.columns)
+
+    def looks(self, side: int) -> float:
+        """Return the number of independent measurements in a patch of side x side pixels, for side up to LAGS.
+
+        That many independent ones would have an equally noisy mean. The correlation along a diagonal is taken as the
+        product of row and column correlations, as for a Gaussian.
+        """
+        weights = 1 - np.arange(side) / side
+        counts = [1 + 2 * float(np.sum(weights[1:] * line[1:side])) for line in (self.rows, self.columns)]
+        return side * side / max(counts[0] * counts[1], 1e-9)
+
+
+def add_products(products: NDArray[np.float64], errors: NDArray[np.floating]) -> None:
+    """Add to `products` (2, LAGS + 1, 2), for each lag along rows and columns, the products' sum and number.
+
+    errors: (height, width), NaN if missing.
+    """
+    known = np.isfinite(errors)
+    values, there = np.where(known, errors, 0).astype(np.float32), known.astype(np.float32)
+    for axis in range(2):
+        across, there_ = (values.T, there.T) if axis else (values, there)
+        across, there_ = np.ascontiguousarray(across), np.ascontiguousarray(there_)
+        width = across.shape[1]
+        for lag in range(min(LAGS + 1, width)):
+            cut = width - lag
+            products[axis, lag] += (
+                np.einsum("ij,ij->", across[:, :cut], across[:, lag:], dtype=np.float64),
+                np.einsum("ij,ij->", there_[:, :cut], there_[:, lag:], dtype=np.float64),
+            )
+
+
+def _sum(line: tuple[float, ...]) -> float:
+    """Return the sum of a correlation over lags of both signs, up to its end."""
+    values = np.array(line)
+    ends = np.flatnonzero(values < LEAST)
+    return 1 + 2 * float(values[1 : ends[0] if ends.size else len(values)].sum())
+
+
+def _falls(line: tuple[float, ...]) -> float:
+    values = np.array(line)
+    below = np.flatnonzero(values < 1 / e)
+    if not below.size:
+        return float(LAGS)
+    i = int(below[0])
+    return float(i - 1 + (values[i - 1] - 1 / e) / (values[i - 1] - values[i]))
+
 
 Array = NDArray[np.float64]
 TERMS = 6
@@ -183,3 +287,123 @@ def _check(wall: Wall, surface: Array, plane: Array, share: float, name: str) ->
     curved = np.abs(surface / plane - 1)[wall.on_wall].max()
     if curved > MAX_CURVED:
         raise StereovoxError(f"{name}: the surface bends by {curved:.0%} of its depth: that is not a flat wall")
+
+
+GROSS = 0.25
+"""Values off by a larger share of the depth are not noise: mismatches, or a person walking through."""
+USUAL = 0.5
+"""A pixel counts if it has a value in this share of the frames; rarer ones scatter in one direction."""
+
+
+@dataclass(eq=False)
+class WallRecording:
+    """Sums over the frames of one recording for each pixel, without gross errors.
+
+    camera: its correction, if any, is already applied. distance: where the optical axis meets the wall, as
+    measured by hand, in metres, or None.
+    sums (4, height, width) float64: number of values, then the sums of 1/z, z and z^2 (z in metres).
+    gross: number of values left out as gross errors; skipped: frames without usable depth, first_fault: why the first
+    of them was. Poses are ignored.
+    products: of the errors of 1/z of neighbouring pixels, see `add_products`, against the surface in the first frame.
+    greys: mean grey level of the pixels with a value, of each frame whose image is known.
+    condition: light, emitter power or texture, in words.
+    """
+
+    name: str
+    camera: PinholeCamera
+    distance: float | None = None
+    frames: int = 0
+    skipped: int = 0
+    first_fault: str = ""
+    gross: int = 0
+    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 0, 0)))
+    products: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, LAGS + 1, 2)))
+    greys: list[float] = field(default_factory=list)
+    condition: str = ""
+
+    @property
+    def count(self) -> NDArray[np.float64]:
+        """Number of values of each pixel, (height, width)."""
+        return self.sums[0]
+
+    @property
+    def inverse(self) -> NDArray[np.float64]:
+        """Mean of 1/z in 1/m, (height, width), NaN if fewer than half the frames have a value.
+
+        Not of z: a stereo camera's noise is uniform in disparity, which is proportional to 1/z; far away the mean of z
+        is biased upwards.
+        """
+        enough = self.count >= max(1.0, USUAL * self.frames)
+        return np.where(enough, self.sums[1] / np.maximum(self.count, 1), np.nan)
+
+    @property
+    def valid_share(self) -> float:
+        """Share of all pixels of all frames that have a value, gross errors left out."""
+        return float(self.count.sum() / max(1, self.frames * self.count.size))
+
+
+def itself(frame: AnyFrame) -> Frame:
+    """Return the frame, which must have depth."""
+    assert isinstance(frame, Frame)
+    return frame
+
+
+def read_wall(
+    frames: Iterable[AnyFrame],
+    name: str,
+    camera: PinholeCamera,
+    distance: float | None = None,
+    matched: Callable[[AnyFrame], Frame] = itself,
+    condition: str = "",
+) -> WallRecording:
+    """Return the sums over `frames`, which may lack poses; depths are corrected if `camera` has a correction.
+
+    matched: turns stereo frames into depth frames. condition: see `WallRecording`.
+
+    The first frame gives the wall, and so defines gross errors.
+    Raises StereovoxError if no frame has usable depth, and as `find_wall` if the first shows no wall.
+    """
+    wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)), condition=condition)
+    expected, gross = None, GROSS
+    for seen in frames:
+        frame = matched(seen)
+        depth_m = metres(frame)
+        if depth_m.shape != wall.count.shape or not np.isfinite(depth_m).any():
+            wall.skipped += 1
+            wall.first_fault = wall.first_fault or frame.fault_detail or f"{frame.name}: no valid depth"
+            continue
+        correct(depth_m, camera)
+        if expected is None:
+            found = find_wall(1 / depth_m.astype(float), camera, name)
+            expected, gross = found.inverse(camera), max(GROSS, 6 * found.noise)
+        _add(wall, depth_m, expected, gross)
+        if isinstance(seen, StereoFrame) and seen.left.shape[:2] == depth_m.shape:
+            wall.greys.append(float(seen.left[np.isfinite(depth_m)].mean()))
+    if not wall.frames:
+        raise StereovoxError(f"{name}: no valid depth in any frame ({wall.first_fault or 'it has none'})")
+    return wall
+
+
+def metres(frame: Frame) -> NDArray[np.float32]:
+    """Return the depth as measured in metres, float32, NaN if missing; poses and corrections are ignored."""
+    raw = np.asarray(frame.depth)
+    depth_m = raw.astype(np.float32) * np.float32(frame.depth_scale)
+    usable = np.isfinite(depth_m) & (depth_m > 0)
+    if raw.dtype == np.uint16:
+        usable &= raw != np.iinfo(np.uint16).max
+    if frame.reason is not None and frame.reason.shape == raw.shape:
+        usable &= frame.reason == Reason.VALID
+    return np.where(usable, depth_m, np.float32(np.nan))
+
+
+def _add(wall: WallRecording, depth_m: NDArray[np.float32], expected: NDArray[np.float64], gross: float) -> None:
+    z = depth_m.astype(float)
+    known = np.isfinite(z)
+    with np.errstate(invalid="ignore"):
+        usable = known & (np.abs(z * expected - 1) <= gross)
+    wall.gross += int(known.sum() - usable.sum())
+    z[~usable] = 0
+    inverse = np.divide(1, z, out=np.zeros_like(z), where=usable)
+    wall.sums += [usable, inverse, z, z * z]
+    add_products(wall.products, np.where(usable, inverse - expected, np.nan))
+    wall.frames += 1

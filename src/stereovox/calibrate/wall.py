@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.calibrate.recording import WallRecording
-from stereovox.calibrate.surface import Array, Wall, find_wall, fit_plane, slopes, terms, tilt_deg
+from stereovox.calibrate.surface import Array, Wall, WallRecording, find_wall, fit_plane, slopes, terms, tilt_deg
 from stereovox.cameras.pinhole import CORRECTIONS, DepthCorrection, PinholeCamera
 from stereovox.depth.prepare import quadratics
 from stereovox.errors import StereovoxError, did_you_mean

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
+from stereovox.cameras.wide import CylindricalCamera, Lens, SphericalCamera
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error
 

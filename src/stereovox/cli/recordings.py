@@ -16,7 +16,7 @@ from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import check_folder
 
 if TYPE_CHECKING:
-    from stereovox.calibrate.recording import WallRecording
+    from stereovox.calibrate.surface import WallRecording
     from stereovox.opening import Stream
 
 LIVE_FRAMES = 60
@@ -76,7 +76,7 @@ def read_walls(
 def _read(
     name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool, condition: str
 ) -> WallRecording:
-    from stereovox.calibrate.recording import read_wall
+    from stereovox.calibrate.surface import read_wall
     from stereovox.config import load_config
     from stereovox.depth import DepthPipeline
     from stereovox.opening import open_images, parse_slice

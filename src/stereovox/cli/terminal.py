@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from stereovox.frame import UpdateReport
-    from stereovox.track.gaps import TrackingGap
+    from stereovox.track.stream import TrackingGap
 
 MAX_SPANS = 10
 """Most spans of lost frames that are printed."""

@@ -15,11 +15,19 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ByteSize, Field, ValidationError, model_validator
 
-from stereovox.config.base import Section
-from stereovox.config.depth import DepthConfig, NoiseConfig, SphereConfig, StereoConfig
-from stereovox.config.maps import MapConfig, ProjectiveConfig, RayConfig, SensorConfig, WindowConfig
-from stereovox.config.robot import AmclConfig, GridConfig, LoopsConfig, ScanConfig, SlamConfig
-from stereovox.config.safety import PaceConfig, TrustConfig
+from stereovox.config.maps import (
+    DepthConfig,
+    MapConfig,
+    NoiseConfig,
+    ProjectiveConfig,
+    RayConfig,
+    Section,
+    SensorConfig,
+    SphereConfig,
+    StereoConfig,
+    WindowConfig,
+)
+from stereovox.config.robot import AmclConfig, GridConfig, LoopsConfig, PaceConfig, ScanConfig, SlamConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
 from stereovox.files.safe_io import read_text, shown, toml_table
 

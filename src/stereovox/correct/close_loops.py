@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config, load_config
 from stereovox.correct.corrected_poses import load_with_frames
 from stereovox.correct.loops.closer import Loop, LoopCloser, check_one_way, ends_of
-from stereovox.correct.loops.odometry import Odometry
-from stereovox.correct.loops.positions import Positions
+from stereovox.correct.loops.drift import Odometry, Positions
 from stereovox.correct.loops.submaps import Submap
 from stereovox.errors import StereovoxError
 from stereovox.files.safe_io import check_file

@@ -121,7 +121,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     If both kept all their frames (`map.keep_frames`) the result is bit for bit the map of one run over both, in the
     order of their stamps, with the poses of `b` brought into the frame of `a`; it keeps the frames of both. A frame in
     both, as from overlapping parts of a recording, counts once, with its pose in `a`. Otherwise (`why_added` gives the
-    reason) their evidence adds up: see `products.edit.merge`. Cells that had reached their limits may then differ from those
+    reason) their evidence adds up: see `edit.merge`. Cells that had reached their limits may then differ from those
     of one run.
 
 

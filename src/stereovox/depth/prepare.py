@@ -2,11 +2,13 @@
 """Prepare a depth image: check the frame, convert to metres, assign a reason to each pixel without a value, denoise.
 
 Each step is also a function: depth correction, denoising, block minima, a shorter range.
+
+The depth pipeline from frame to depth image: match, check, clean, and gather on the spherical grid.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import isnan
 
 import numpy as np
@@ -16,9 +18,11 @@ from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.depth import _denoise, _images
-from stereovox.depth.quality import SPARSE, check_unit
+from stereovox.depth.quality import SPARSE, check_depth, check_light, check_unit
+from stereovox.depth.sphere.image import through_sphere
+from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
-from stereovox.frame import DepthImage, Frame, Reason, name_of
+from stereovox.frame import AnyFrame, DepthImage, Frame, Rays, Reason, StereoFrame, name_of
 from stereovox.frame.validate import for_kernels, rigid_pose, validate_fields
 from stereovox.sensors.noise import RangeNoise
 
@@ -252,3 +256,42 @@ def stretched(correlation_px: float) -> int:
 def _numbers(noise: RangeNoise, fine: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return s0, s1, s2 (3,) of the noise, and for each pass the noise in metres that it leaves alone."""
     return np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
+
+
+class DepthPipeline:
+    """Turns frames into depth images as configured."""
+
+    def __init__(self, config: Config):
+        self._config = config
+
+    def matched(self, frame: AnyFrame) -> Frame:
+        """Return a stereo frame with its depth, any other frame unchanged.
+
+        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for clouds and anything that is not a
+        frame.
+        """
+        if isinstance(frame, Frame):
+            return frame  # `prepare` validates its fields
+        if isinstance(frame, Rays):
+            validate_fields(frame, type(frame))
+            detail = "is not an image: it can be mapped with given poses, but not tracked"
+            raise FrameRefused("bad_form", f"{name_of(frame)}: {detail}")
+        validate_fields(frame, StereoFrame, Frame)
+        assert isinstance(frame, StereoFrame)
+        check_light(frame, self._config.trust.max_unexposed_share)
+        return self._stereo(frame)
+
+    def image(self, frame: Frame) -> DepthImage:
+        """Return the frame's depth image. Raises FrameRefused as `prepare` and `check_depth`."""
+        return through_sphere(self.checked(frame), self._config)
+
+    def checked(self, frame: Frame) -> DepthImage:
+        """Return what `image` returns, but before it is gathered on a spherical grid."""
+        image = prepare(frame, self._config)
+        check_depth(image, frame, self._config)
+        return image
+
+    @cached_property
+    def _stereo(self) -> StereoDepth:
+        """Created for the first stereo frame: other recordings need no OpenCV."""
+        return StereoDepth(self._config.stereo)

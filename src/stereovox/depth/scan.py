@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.depth import _scan
+from stereovox.depth import _cloud
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import DepthImage, Reason, Scan
 from stereovox.geometry.se2 import lifted
@@ -282,7 +282,7 @@ def _gathered(
     start, end, unmeasured = np.zeros((3, n), np.float32)
     beams = Beams(np.full(n, np.inf, np.float32), start, end, np.full(n, np.inf, np.float32), unmeasured)
     fan = Fan(np.float32(1 / where.step), np.float32(-where.first / where.step), np.float32(n - 1))
-    _scan.gather(
+    _cloud.gather(
         depth_m, reason, rays.columns, rays.rows, rays.edge_columns, rays.edge_rows, turn.astype(np.float32), band, fan,
         beams, np.empty((9, len(rays.edge_columns)), np.float32),
     )  # fmt: skip

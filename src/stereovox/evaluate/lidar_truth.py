@@ -18,7 +18,7 @@ from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.evaluate.truth import indices, keys
 from stereovox.frame import Cloud, Viewpoint
 from stereovox.geometry.se3 import inverse, transform_points
-from stereovox.integrate.crossing import crossed_cells
+from stereovox.integrate.points import crossed_cells
 from stereovox.maps import VoxelMap
 from stereovox.maps.record.history import History
 from stereovox.maps.storage.blocks import SIDE, BlockPool

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth import DepthPipeline
-from stereovox.depth.cloud import checked_cloud
-from stereovox.depth.ranges import cloud_of
+from stereovox.depth.cloud import checked_cloud, cloud_of
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.files.safe_io import replacing
 from stereovox.formats.points import cell_colours

@@ -24,7 +24,7 @@ from stereovox.formats.cell_size import suggested_cell
 from stereovox.formats.read_points import MAX_BLOCKS
 from stereovox.frame import Cloud
 from stereovox.geometry.se3 import Transform, from_quaternion, transform_points
-from stereovox.integrate.crossing import scan_evidence
+from stereovox.integrate.points import scan_evidence
 from stereovox.maps import VoxelMap
 from stereovox.maps.record.history import Imported
 

@@ -3,12 +3,17 @@
 
 An event cannot arrive before it happens, so each stamp that arrives (of a frame or a pose) is a lower bound for the
 present time by the stamps' clock. Ages are counted from the best bound that is known, never from arrival alone.
+
+The clock on the wall, by which cameras and other programs stamp: to measure ages and to stamp what is played.
+
+It may be set at any moment, so nothing waits, ends or is decided by it; a test keeps it out of all other files.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from time import time_ns
 from typing import Literal
 
 from stereovox.errors import ConfigError
@@ -112,3 +117,8 @@ class StampClock:
         self._offsets: dict[str, deque[int]] = {}
         self._least: tuple[int, int] | None = None
         self._recognised: Callable[[], int] | None = None
+
+
+def epoch_ns() -> int:
+    """Return nanoseconds since 1970 by this machine's clock."""
+    return time_ns()

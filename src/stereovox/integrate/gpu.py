@@ -25,7 +25,7 @@ from stereovox.kernels.device import check_device
 from stereovox.maps.storage.blocks import CELLS, table_size
 from stereovox.maps.storage.gpu import GpuArrays, GpuEvidence
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.protocol import InverseSensorModel
 
 HIT_ROOM = 1024
 """Initial room for blocks with hits."""

@@ -38,7 +38,7 @@ from stereovox.kernels.threads import Scratch, in_shards, run_both, shards
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, BlockPool
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.protocol import InverseSensorModel
 
 LEVELS = _windows.COARSEST + 1
 """Number of window sizes: one pixel, and three tiles of 1 to 128 pixels."""

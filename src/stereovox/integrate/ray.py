@@ -35,7 +35,7 @@ from stereovox.kernels.threads import in_shards, shards
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, SIDE, BlockPool
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.protocol import InverseSensorModel
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]

@@ -21,9 +21,9 @@ from stereovox.integrate import _cells
 from stereovox.maps.cells.evidence import to_units
 from stereovox.maps.query.queries import INDEX_LIMIT
 from stereovox.maps.storage.blocks import CELLS, SIDE
-from stereovox.sensors.arc import Arc
-from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
+from stereovox.sensors.models import Arc
 from stereovox.sensors.noise import PoseNoise, RangeNoise
+from stereovox.sensors.protocol import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 
 CACHE_LINE = 64
 """Bytes."""

@@ -17,9 +17,9 @@ from stereovox.live.stream import LiveStream
 from stereovox.mapper import Mapper
 from stereovox.mavlink.link import MavlinkLink
 from stereovox.mavlink.pose_sender import PoseMessage, PoseSender
+from stereovox.mavlink.poses import MavlinkPoses
 from stereovox.mavlink.sectors import SectorRules
 from stereovox.mavlink.sending import ObstacleSender
-from stereovox.mavlink.stream import MavlinkPoses
 from stereovox.products.floor_axes import up_of
 from stereovox.sources.poses.live_poses import LivePoses, NewestPose
 from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream

@@ -2,14 +2,17 @@
 """Outputs of a growing map: a 2-D map in files, and the distances in all directions around the body.
 
 Each is an observer of the run: `after` for each frame, `finish` once the last one is in the map, `close` at the end.
+
+The latency of images from the camera into the map, and to all outputs of the map.
 """
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from time import monotonic
+from time import monotonic, monotonic_ns
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,10 +22,13 @@ from stereovox.depth import DepthPipeline
 from stereovox.depth.sphere import SphereGrid, SphereLayout, accumulate
 from stereovox.depth.sphere.vehicle import together
 from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.evaluate.metrics import percentiles
 from stereovox.files.safe_io import FLOOR_ENDINGS, check_file
 from stereovox.formats.map_server import write_map_server
 from stereovox.frame import Rays, UpdateReport
+from stereovox.frame.stamp_clock import epoch_ns
 from stereovox.geometry.se3 import Transform, inverse
+from stereovox.live.stream import Moment
 from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.context import context_of
@@ -224,3 +230,56 @@ class LiveSphere:
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
+
+
+STAMP, ARRIVAL = "stamp", "arrival"
+
+
+class Latency:
+    """Milliseconds since the stamp of each mapped image, or since its arrival if the stamp is by another clock.
+
+    Args:
+        moment: Returns when the newest image was taken and arrived.
+    """
+
+    def __init__(self, moment: Callable[[], Moment]):
+        self._moment = moment
+        self._map_ms, self._outputs_ms = array("d"), array("d")
+        self._since: set[str] = set()
+        self.mapped = _Mark(self._map)
+        self.sent = _Mark(self._sent)
+
+    def summary(self) -> dict[str, Any]:
+        """Return median, p90, p99 and max of `map` and `outputs`, and `since`: `stamp`, `arrival` or both."""
+        return {
+            "map": percentiles(self._map_ms.tolist()),
+            "outputs": percentiles(self._outputs_ms.tolist()),
+            "since": " and ".join(sorted(self._since, reverse=True)),
+        }
+
+    def _map(self, report: UpdateReport) -> None:
+        if not report.refused:
+            self._map_ms.append(self._age_ms())
+
+    def _sent(self, report: UpdateReport) -> None:
+        if not report.refused:
+            self._outputs_ms.append(self._age_ms())
+
+    def _age_ms(self) -> float:
+        moment = self._moment()
+        if moment.taken_ns is None:
+            self._since.add(ARRIVAL)
+            return (monotonic_ns() - moment.arrived_ns) / 1e6
+        self._since.add(STAMP)
+        return (epoch_ns() - moment.taken_ns) / 1e6
+
+
+class _Mark:
+    """An observer that records the time."""
+
+    def __init__(self, note: Callable[[UpdateReport], None]):
+        self._note = note
+
+    def after(self, frame: Any, report: UpdateReport) -> None:
+        """Record a frame."""
+        self._note(report)

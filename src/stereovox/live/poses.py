@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from stereovox import registry
 from stereovox.errors import SourceError
-from stereovox.runs.pose_choice import GIVEN, TRACK
+from stereovox.runs.warm_up import GIVEN, TRACK
 from stereovox.sources.poses.pose_stream import PoseStream
 
 POSES = {
     "udp": "stereovox.sources.poses.pose_stream:UdpPoses",
     "tcp": "stereovox.sources.poses.pose_stream:TcpPoses",
     "t265": "stereovox.sources.poses.pose_stream:T265",
-    "mavlink": "stereovox.mavlink.stream:MavlinkPoses",
+    "mavlink": "stereovox.mavlink.poses:MavlinkPoses",
 }
 """Streams of poses (`PoseStream`), tried in this order after entry points in the group `stereovox.poses`."""
 

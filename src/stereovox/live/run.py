@@ -11,8 +11,7 @@ from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any
 
 from stereovox.errors import StereovoxError
-from stereovox.live.latency import Latency
-from stereovox.live.outputs import GridFile, LiveSphere, Output
+from stereovox.live.outputs import GridFile, Latency, LiveSphere, Output
 from stereovox.live.poses import open_poses
 from stereovox.live.recorder import Recorder
 from stereovox.live.rig import LiveCamera, read_live
@@ -21,9 +20,8 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.products.floor_axes import Heights
 from stereovox.runs.engine import MapOptions, Observer, Run, RunResult, takes
-from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.runs.recording import MapRun
-from stereovox.runs.warm_up import warm_up
+from stereovox.runs.warm_up import GIVEN, TRACK, warm_up
 from stereovox.sources.base import Stream
 from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.pose_stream import PoseStream

@@ -1,24 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The track of a ground robot's recording, by SLAM or by localisation in a map, and its fit."""
+"""The track of a ground robot's recording, by SLAM or by localisation in a map, and its fit.
+
+Fit of a robot's scans to a map along its track: a check for the right map and the right place.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.errors import MissingExtra, StereovoxError
-from stereovox.frame import Progress, no_progress
+from stereovox.errors import FrameRefused, MissingExtra, StereovoxError
+from stereovox.frame import Progress, Scan, no_progress
+from stereovox.frame.validate import validate_scan
+from stereovox.geometry import se2
 from stereovox.geometry.pose_graph import need_gtsam
 from stereovox.localize.amcl.localise import localise
-from stereovox.localize.fit import NEAR, fit_share
-from stereovox.localize.slam.doubts import MapDoubt
+from stereovox.localize.amcl.particles import DistanceField, distance_field
+from stereovox.localize.slam.graph import MapDoubt
 from stereovox.localize.slam.pipeline import SlamResult, map_scans
-from stereovox.localize.track import Track
-from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.localize.track import Track, beams_of
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.sources.robots.robot import Robot
+
+NEAR = 0.25
+"""Metres from an obstacle of the map within which a beam fits."""
+SCANS, BEAMS, RIGID = 60, 60, 5e-3
+
+
+def fit_share(grid: OccupancyGrid, scans: Sequence[Scan], track: Track) -> float | None:
+    """Return the share of beams (0 to 1) that end near an obstacle of the map, over scans spread along the track.
+
+    Beams without a return do not count. None if no beam has a return.
+    """
+    field = distance_field(_with_rim(grid), 2 * NEAR)
+    found = [_distances(field, scans[i], track) for i in _spread(len(scans))]
+    all_of_them = np.concatenate([np.empty(0), *found])
+    return float(np.mean(all_of_them <= NEAR)) if all_of_them.size else None
+
+
+def _with_rim(grid: OccupancyGrid) -> OccupancyGrid:
+    """Return the map padded with unknown cells, so that walls at its border have a far side too."""
+    rim = ceil(NEAR / grid.resolution)
+    x, y, yaw = se2.compose(grid.origin, [-rim * grid.resolution, -rim * grid.resolution, 0.0]).tolist()
+    return replace(grid, cells=np.pad(grid.cells, rim, constant_values=UNKNOWN), origin=(x, y, yaw))
+
+
+def _spread(count: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, min(SCANS, count)).astype(int)).tolist()
+
+
+def _distances(field: DistanceField, scan: Scan, track: Track) -> np.ndarray:
+    try:
+        beams = beams_of(validate_scan(scan, RIGID)).some(BEAMS, hits_only=True)
+    except FrameRefused:
+        return np.empty(0)
+    pose = se2.compose(track.correction(scan.stamp_ns), scan.pose_world_base)
+    return np.asarray(field.at(se2.transform(pose, beams.ends)), float)
+
 
 DOUBTFUL = 0.6
 """Share of fitting beams below which the track may be wrong."""

@@ -17,8 +17,7 @@ from stereovox.frame import AnyFrame, AnyImage, CheckedCloud, DepthImage
 from stereovox.geometry.se3 import Transform, apart, rotation_matrix
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.mapping.disagreement import EXPLAINED, FEW, MOSTLY_KNOWN, Sight
-from stereovox.mapping.frozen import BLUR, FARTHEST
-from stereovox.mapping.gate import Gate, GateResult
+from stereovox.mapping.gate import BLUR, FARTHEST, Gate, GateResult
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.query.queries import RayHits
@@ -26,8 +25,8 @@ from stereovox.maps.record.glance import Glance, Votes
 from stereovox.maps.record.history import DisagreementSpell
 from stereovox.maps.voxel_map import leaning
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import InverseSensorModel
 from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.protocol import InverseSensorModel
 
 FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, for their noise is wider than a cell."""

@@ -20,17 +20,16 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.depth import DepthPipeline
-from stereovox.depth.cloud import checked_cloud
+from stereovox.depth.cloud import checked_cloud, cloud_of
 from stereovox.depth.prepare import downsample, shortened
-from stereovox.depth.ranges import cloud_of
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Cloud, DepthImage, Frame, Rays
 from stereovox.integrate import Integration
 from stereovox.integrate.views import MAX_CAMERAS
 from stereovox.kernels.threads import Ahead
 from stereovox.maps.record.health import FULL
-from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.protocol import REACH_SIGMA
 
 PATIENCE, MAX_PATIENCE = 8, 128
 """Frames in time before the next better level is tried: at first, and at most; one frame in 128 is less than 1 %."""

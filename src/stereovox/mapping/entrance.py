@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from stereovox.depth import DepthPipeline, cloud, quality, ranges, scan
+from stereovox.depth import DepthPipeline, cloud, quality, scan
 from stereovox.depth.prepare import _check_image, prepare
 from stereovox.depth.stereo import pipeline as stereo
 from stereovox.frame import validate
@@ -145,7 +145,7 @@ CHECKS = (
     Check("no_valid_point", "not one ray can be used",
           _cells("see `no_valid_depth`", cloud.checked_cloud, "see `no_valid_range`", ranged=ONE_NUMBER)),
     Check("no_valid_range", "not one beam has a range, or nothing was heard, which clears nothing (`silence_clears`)",
-          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan, ranged=ranges.distance_of)),
+          _cells("see `no_valid_depth`", "see `no_valid_point`", quality.check_scan, ranged=cloud.distance_of)),
     Check("too_few_values", "less than 0.5 % of the pixels, points or beams have a value or are too far",
           _cells(quality._check_share, quality._check_number, quality._check_number,
                  ranged=ONE_NUMBER), "trust.min_valid_share"),
@@ -158,7 +158,7 @@ CHECKS = (
           _cells(LIT, quality.check_light, LIT, LIT, LIT, quality.check_light), "trust.max_unexposed_share"),
     Check("tilted", "the lidar leans by more than 5 degrees, so its beams meet the floor",
           _cells(SPACE, SPACE, SPACE, validate.validate_upright_scan, "see `camera_tilted`", "see `camera_tilted`",
-                 on_floor=ranges.level_range),
+                 on_floor=cloud.level_range),
           "grid.max_tilt_deg"),
     Check("camera_tilted", "no row of the image is level (method `rows`; `cloud` accepts any attitude)",
           _cells(SPACE, SPACE, SPACE, "see `tilted`", scan.level_rows, scan.level_rows), "scan.off_level_deg"),

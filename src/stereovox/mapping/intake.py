@@ -10,8 +10,7 @@ from types import TracebackType
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, AnyImage, Range, Scan, UpdateReport
-from stereovox.frame.stamp_clock import StampsBy
-from stereovox.frame.wall_clock import epoch_ns
+from stereovox.frame.stamp_clock import StampsBy, epoch_ns
 from stereovox.kernels.threads import MapLock
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import VoxelMap

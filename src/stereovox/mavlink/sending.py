@@ -14,10 +14,9 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import R_SENSOR_OPTICAL, AnyFrame, Range, Rays, UpdateReport
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.mapper import Mapper
-from stereovox.mavlink.body import Body, BodyPose
-from stereovox.mavlink.directions import DirectionRules, nearest_places
 from stereovox.mavlink.link import MavlinkLink, Tell, warn
-from stereovox.mavlink.sectors import INCREMENT_DEG, SectorRules, obstacle_sectors
+from stereovox.mavlink.pose_sender import Body, BodyPose
+from stereovox.mavlink.sectors import INCREMENT_DEG, DirectionRules, SectorRules, nearest_places, obstacle_sectors
 
 T_BODY_LIDAR = np.eye(4)
 """Default mount of a lidar: at the body's origin, facing ahead."""

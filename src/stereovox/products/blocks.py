@@ -15,7 +15,7 @@ from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap, unbounded
 from stereovox.maps.storage.blocks import CELLS, MAX_PLACES, SIDE, blocks_of_cells
 from stereovox.maps.storage.rolling import RollingStorage
-from stereovox.products import _distance as _margin
+from stereovox.products import _distance
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 """Coordinates (n, 3), and the cells (n, 512) of two maps as each stores them."""
@@ -91,7 +91,7 @@ def with_margins(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.int32], NDArr
         ends = (coords.min(axis=0), coords.max(axis=0) + 1) if len(coords) else (np.zeros(3, int),) * 2
         stored = voxel_map.storage.cells_within(SIDE * ends[0] - 1, SIDE * ends[1] + 1)
         out = np.empty((len(coords), *(SIDE + 2,) * 3), stored.values.dtype)
-        _margin.with_margin(stored, np.ascontiguousarray(coords), out)
+        _distance.with_margin(stored, np.ascontiguousarray(coords), out)
         yield coords, out
 
 

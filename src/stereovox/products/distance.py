@@ -26,7 +26,6 @@ from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.query.queries import INDEX_LIMIT, points_of, state_bits
 from stereovox.maps.storage.blocks import CELLS, SIDE
 from stereovox.products import _distance
-from stereovox.products import _distance as _transform
 
 LANES = 32
 """Rows are padded to a multiple of this: whole vectors."""
@@ -93,10 +92,10 @@ class Transform:
         """Update `field` after its mask changed in the slabs marked in `dirty` (slabs,)."""
 
         def in_slabs(part: slice) -> None:
-            _transform.across_slabs(self.field, self.costs, self.lanes, dirty, part.start, threads)
+            _distance.across_slabs(self.field, self.costs, self.lanes, dirty, part.start, threads)
 
         def in_planes(part: slice) -> None:
-            _transform.across_planes(self.field, self.costs, part.start, threads)
+            _distance.across_planes(self.field, self.costs, part.start, threads)
 
         interleaved = [slice(n, None) for n in range(threads)]  # changes are close together
         in_shards(in_slabs, interleaved)
@@ -126,11 +125,11 @@ class Transform:
 
     def _empty(self, slabs: int, rows: int) -> Field:
         padded, none = self.costs.lanes.size // 2, self.costs.none
-        mask, runs = np.zeros((slabs, rows, padded), np.uint8), np.full((slabs, rows, padded), _transform.FAR)
+        mask, runs = np.zeros((slabs, rows, padded), np.uint8), np.full((slabs, rows, padded), _distance.FAR)
         squares = np.zeros((rows, slabs, padded), np.float32)  # zero in the padding: nothing to search there
         squares[:, :, : self.lanes] = none
         superseded, metres = np.empty_like(squares), np.full_like(squares, np.inf)
-        lowest, touched = np.full((rows, slabs), none), np.full((rows, slabs), _transform.UNCHANGED)
+        lowest, touched = np.full((rows, slabs), none), np.full((rows, slabs), _distance.UNCHANGED)
         return Field(mask, runs, squares, superseded, squares.copy(), metres, lowest, lowest.copy(), touched)
 
 

@@ -19,8 +19,9 @@ from stereovox.frame import Frame, Rays, UpdateReport
 from stereovox.geometry.se3 import inverse
 from stereovox.mapping.rebuild import CorrectionReport
 from stereovox.ros.inputs import PoseLookup, header
-from stereovox.ros.mapping import Mapping
-from stereovox.ros.obstacles import Obstacles
+from stereovox.ros.library import StampsByNode
+from stereovox.ros.mapping import Mapping, Services
+from stereovox.ros.obstacles import Obstacles, score_of
 from stereovox.ros.options import Options
 from stereovox.ros.outputs import Outputs
 from stereovox.ros.poses.clocks import SensorClocks
@@ -28,9 +29,6 @@ from stereovox.ros.poses.corrections import AGAIN_S, PathCorrections, corrector_
 from stereovox.ros.poses.pose_source import pose_source
 from stereovox.ros.poses.poses import Pose, SensorPoses, fixed_transform
 from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses
-from stereovox.ros.score import score_of
-from stereovox.ros.services import Services
-from stereovox.ros.stamps import StampsByNode
 from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.sources.poses.clock_watch import Heard
 from stereovox.sources.waiting import Arrival, Waiting

@@ -19,14 +19,12 @@ from stereovox.formats.map_server import write_map_server
 from stereovox.frame import UpdateReport
 from stereovox.maps.files.lock import only_writer_in, only_writer_of_floor
 from stereovox.maps.files.store import check_target, sweep
-from stereovox.ros.mapping import Mapping
+from stereovox.ros.mapping import Mapping, check_continuable
 from stereovox.ros.node import MapNode
 from stereovox.ros.options import OUT, SLAM, Options, freeze
 from stereovox.ros.poses.corrections import check_corrections
-from stereovox.ros.services import check_continuable
 from stereovox.runs.engine import Checkpoints, MapOptions, Run
-from stereovox.runs.pose_choice import NOT_COMPARED, TRACK, uncompared
-from stereovox.runs.warm_up import warm_up
+from stereovox.runs.warm_up import NOT_COMPARED, TRACK, uncompared, warm_up
 
 MAX_REPORTS = 10_000
 """Most recent frames whose times are summarised at the end."""

@@ -23,7 +23,7 @@ from stereovox.files.safe_io import FLOOR_ENDINGS, FLOOR_READABLE, check_file
 from stereovox.formats.map_server import MODES, read_map_server
 from stereovox.frame import Frame, Progress, Scan, no_progress
 from stereovox.localize.robot_track import check_start, doubt_lines, fit_of, localise_robot, refused_line, slam_robot
-from stereovox.localize.slam.doubts import MapDoubt
+from stereovox.localize.slam.graph import MapDoubt
 from stereovox.localize.track import Track
 from stereovox.mapper import GridMapper
 from stereovox.maps.files.lock import only_writer_of_floor
@@ -31,8 +31,8 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_robot, parse_slice
 from stereovox.runs.engine import Checkpoints, MapOptions, MapperRun, Observer, takes
-from stereovox.runs.pose_choice import NOT_COMPARED, uncompared
 from stereovox.runs.recording import MapResult
+from stereovox.runs.warm_up import NOT_COMPARED, uncompared
 from stereovox.sources.robots.robot import Robot, in_time_order
 
 SLAM, ODOMETRY = "slam", "odometry"

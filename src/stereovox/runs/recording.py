@@ -42,18 +42,16 @@ from stereovox.runs.engine import (
     frames_offered,
     takes,
 )
-from stereovox.runs.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.runs.survey import LEVELLED, TILTED, level_start, survey
+from stereovox.runs.warm_up import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.turned import Turned
-from stereovox.track.gaps import LostSpans, TrackingGap
-from stereovox.track.guided import GuidedTracker
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.stream import AnyTracker, TrackedStream
+from stereovox.track.stream import AnyTracker, GuidedTracker, LostSpans, TrackedStream, TrackingGap
 from stereovox.track.tracker import Tracker
 
 if TYPE_CHECKING:
-    from stereovox.localize.slam.doubts import MapDoubt
+    from stereovox.localize.slam.graph import MapDoubt
     from stereovox.localize.track import Track
 
 MAX_UNUSABLE = 100

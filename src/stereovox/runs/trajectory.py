@@ -23,15 +23,14 @@ from stereovox.geometry.se3 import Transform
 from stereovox.kernels.threads import expecting
 from stereovox.opening import open_source
 from stereovox.runs.engine import SURVEYED, Checkpoints, Run, RunOptions, takes
-from stereovox.runs.pose_choice import TRACK, choose_poses
 from stereovox.runs.survey import level_start, survey
+from stereovox.runs.warm_up import TRACK, choose_poses
 from stereovox.sources.base import Source, Stream, prefetch
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import TRAJECTORY_ENDINGS, write_trajectory
-from stereovox.track.gaps import LostSpans, TrackingGap
 from stereovox.track.inertial import imu_and_note
-from stereovox.track.stream import LOST, follow
+from stereovox.track.stream import LOST, LostSpans, TrackingGap, follow
 from stereovox.track.tracker import Tracked, Tracker
 
 DOING = "tracking"

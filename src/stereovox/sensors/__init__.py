@@ -9,13 +9,13 @@ from typing import Any
 from stereovox import registry
 from stereovox.config import SensorConfig
 from stereovox.errors import ConfigError, did_you_mean
-from stereovox.sensors.model import InverseSensorModel
+from stereovox.sensors.protocol import InverseSensorModel
 
 SENSORS = {
-    "stereo": "stereovox.sensors.stereo:Stereo",
-    "andert": "stereovox.sensors.andert:Andert",
-    "valenti": "stereovox.sensors.valenti:Valenti",
-    "constant": "stereovox.sensors.constant:Constant",
+    "stereo": "stereovox.sensors.models:Stereo",
+    "andert": "stereovox.sensors.models:Andert",
+    "valenti": "stereovox.sensors.models:Valenti",
+    "constant": "stereovox.sensors.models:Constant",
 }
 
 

@@ -61,7 +61,7 @@ class RangeNoise:
         s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square missing in print (Alg 3 has it), which
         is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
         in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
-        the noise grows (`stereovox.depth.stereo.reproject`), which the thesis also leaves out.
+        the noise grows (`stereovox.depth.stereo.disparity`), which the thesis also leaves out.
         """
         if isinstance(camera, Lidar):
             return cls(camera.sigma, 0.0, 0.0)

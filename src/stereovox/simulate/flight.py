@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`sim:flight`: kilometres along a hall and back, cheap enough to render a whole flight."""
+"""`sim:flight`: kilometres along a hall and back, cheap enough to render a whole flight.
+
+Poses of a simulation that drift like a tracker's. A person walks from waypoint to waypoint with a camera in the hand.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stereovox.geometry.se3 import Transform, look_at
+from stereovox.geometry.se3 import Transform, inverse, look_at, rotation_matrix
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.scene import Scene, Solid, box
 from stereovox.simulate.stage import Stage, within
+from stereovox.simulate.t265 import OPENGL, STEP_S, Drift, drifted, start_frame
 
 LANE = 2.0
 """Metres between the hall's middle and the path, on the right both ways; also the radius of the turn at the end."""
@@ -99,3 +105,85 @@ def _side(name: str, x: float, sign: float, random: np.random.Generator) -> list
         part("pillars", pillar, 0.35, 3.6, 3.95, HEIGHT),
         part("boxes", thing, random.uniform(0.4, 1.4), inner, inner + deep, top),
     ]
+
+
+YAW_DEG = 5.0
+"""Degrees of heading drift over one metre if positions drift by one metre a metre: a tracker that is off
+by 1 % turns by 0.05 degrees (see `Drift`)."""
+
+CameraPath = Callable[[float], Transform]
+"""T_world_camera (4, 4), optical axes, at a share of the path, 0 to 1."""
+
+
+def drifting(path: CameraPath, seconds: float, share: float, random: np.random.Generator) -> CameraPath:
+    """Return the path as reported by a tracker that never recognises a place.
+
+    path: the true one, world z up; it takes `seconds`. share: metres of error per metre travelled, in all directions;
+    the heading drifts too (`YAW_DEG`), roll and pitch stay right. The first pose is true, and errors belong to
+    positions on the path, not to images: they are the same for any number of frames. Raises StereovoxError if the first
+    pose has no heading.
+    """
+    shares = np.linspace(0, 1, max(2, math.ceil(seconds / STEP_S) + 1))
+    true = np.array([path(step) for step in shares.tolist()])
+    T_start_world = start_frame(true[0])
+    drift = Drift(share=share, yaw_deg=YAW_DEG * share, find_again_m=0)
+    poses = T_start_world @ true @ OPENGL
+    shift, yaw = drifted(drift, shares * seconds, poses, np.zeros(len(shares)), random)
+    errors = np.column_stack([shift, yaw])
+
+    def reported(share: float) -> Transform:
+        x, y, z, turn = (np.interp(share, shares, column) for column in errors.T)
+        T = T_start_world @ path(share)
+        T[:3, :3] = rotation_matrix([0, turn, 0]) @ T[:3, :3]
+        T[:3, 3] += x, y, z
+        return inverse(T_start_world) @ T
+
+    return reported
+
+
+TURN_DEG = 70.0
+"""Degrees a second at which the camera turns."""
+EYE, PITCH_DEG = 1.35, -9.0
+"""Height above the floor in metres; downward pitch of the camera in degrees while walking."""
+
+
+def walk(
+    waypoints: NDArray[np.float64], speed: float, turn_deg: float = TURN_DEG
+) -> tuple[Callable[[float], Transform], float]:
+    """Return the path (T_world_camera at a share of it) and its duration in seconds at `speed` m/s.
+
+    waypoints: (N, 3) x and y in metres and yaw in degrees (0: along x, 90: along y; never a jump from 180 to -180).
+    Between two of them the camera walks and turns (`turn_deg` a second) at once; the slower of both sets the time,
+    and it never leaves the rectangle between them. Floor at z = 0. The first image is exactly level.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    times = _times(waypoints, speed, turn_deg)
+    way = PchipInterpolator(times, waypoints)  # no overshoot: it would walk into walls
+
+    def path(share: float) -> Transform:
+        seconds = share * times[-1]
+        x, y, yaw_deg = way(seconds)
+        return _held(np.array([x, y, EYE]), np.radians(yaw_deg), seconds)
+
+    return path, float(times[-1])
+
+
+def _times(waypoints: NDArray[np.float64], speed: float, turn_deg: float) -> NDArray[np.float64]:
+    """Return the second (N,) at which each waypoint is reached."""
+    steps = np.diff(waypoints, axis=0)
+    walking = np.linalg.norm(steps[:, :2], axis=1) / speed
+    turning = np.abs(steps[:, 2]) / turn_deg
+    return np.append(0.0, np.cumsum(np.maximum(walking, turning)))
+
+
+def _held(eye: NDArray[np.float64], yaw: float, seconds: float) -> Transform:
+    """Return T_world_camera of a hand-held camera: it bobs with the steps, sways and tilts slightly down."""
+    beat = 2 * np.pi * seconds
+    eye = eye + np.array([0, 0, 0.012 * np.sin(1.8 * beat)])
+    pitch = np.radians(PITCH_DEG * (1 - np.exp(-seconds)) + 1.5 * np.sin(0.7 * beat))
+    roll = np.radians(1.2 * np.sin(0.9 * beat))
+    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    T = look_at(eye, eye + ahead)
+    T[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, roll])
+    return T

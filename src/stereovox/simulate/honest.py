@@ -17,7 +17,7 @@ from stereovox.frame import Reason
 from stereovox.geometry.se3 import Transform
 from stereovox.simulate import _texture
 from stereovox.simulate.d435 import D435, JUMP_PX, extreme, hidden_from_right_eye, smooth_noise
-from stereovox.simulate.floors.kinect import WIDTH, kinect_camera
+from stereovox.simulate.floors.drive import WIDTH, kinect_camera
 
 Image = NDArray[np.float32]
 

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import registry
-from stereovox.cameras.lenses import Lens
+from stereovox.cameras.wide import Lens
 from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Photo, Reason
 from stereovox.geometry.se3 import Transform, inverse
-from stereovox.simulate.d435 import D435, classify, depth_camera
-from stereovox.simulate.drift import CameraPath, drifting
-from stereovox.simulate.floors.kinect import WIDTH
+from stereovox.simulate.d435 import D435, classify, depth_camera, photograph
+from stereovox.simulate.flight import CameraPath, drifting
+from stereovox.simulate.floors.drive import WIDTH
 from stereovox.simulate.honest import honest_d435, honest_kinect
-from stereovox.simulate.rendering import photograph
 from stereovox.simulate.scene import Scene
 from stereovox.simulate.stage import Face, Stage, one_of, within
 from stereovox.sources import parameters
@@ -28,13 +27,13 @@ from stereovox.sources.base import DepthSource
 
 SCENES = {
     "room": "stereovox.simulate.scenes.room:stage",
-    "box": "stereovox.simulate.scenes.plain_scenes:box_stage",
-    "aisle": "stereovox.simulate.scenes.plain_scenes:aisle_stage",
+    "box": "stereovox.simulate.scenes.hall:box_stage",
+    "aisle": "stereovox.simulate.scenes.hall:aisle_stage",
     "apartment": "stereovox.simulate.scenes.apartment:stage",
-    "wall": "stereovox.simulate.scenes.plain_scenes:wall_stage",
+    "wall": "stereovox.simulate.scenes.hall:wall_stage",
     "flight": "stereovox.simulate.flight:stage",
     "town": "stereovox.simulate.scenes.town:stage",
-    "loop": "stereovox.simulate.scenes.loop:stage",
+    "loop": "stereovox.simulate.scenes.corridors:stage",
     "offices": "stereovox.simulate.scenes.offices:stage",
     "racks": "stereovox.simulate.scenes.racks:stage",
     "hall": "stereovox.simulate.scenes.hall:stage",

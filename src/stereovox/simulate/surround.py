@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes, StereoPair
-from stereovox.cameras.wide import SphericalCamera
+from stereovox.cameras.wide import Lens, SphericalCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Reason, StereoFrame
 from stereovox.geometry.se3 import Transform, look_at, rotation_matrix
-from stereovox.simulate.rendering import photograph
+from stereovox.simulate.d435 import photograph
 from stereovox.simulate.scene import Scene
 from stereovox.simulate.scenes import room
 from stereovox.simulate.stage import Stage, one_of, within

@@ -9,7 +9,7 @@ from threading import Event
 from time import monotonic_ns
 
 from stereovox.frame import AnyFrame
-from stereovox.frame.wall_clock import epoch_ns
+from stereovox.frame.stamp_clock import epoch_ns
 from stereovox.sources.base import Stream
 
 

@@ -17,10 +17,9 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
 from stereovox.frame.validate import matrix_of
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
-from stereovox.track._photos import laid_into
-from stereovox.track.corners import SOFT, WINDOW
+from stereovox.track._sightings import laid_into
 from stereovox.track.fit import RIGID, Equations, Fit, Stage, motion_between, solve_stages
-from stereovox.track.landmarks import Landmarks, Sight
+from stereovox.track.landmarks import SOFT, WINDOW, Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
 

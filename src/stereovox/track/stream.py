@@ -1,21 +1,162 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings and cameras whose poses are tracked: the frames of a source with the poses of a `Tracker`."""
+"""Recordings and cameras whose poses are tracked: the frames of a source with the poses of a `Tracker`.
+
+Tracking gaps: spans of frames without a pose. The frames' own poses, corrected by tracking.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from stereovox.config import Config
 from stereovox.errors import SourceError
-from stereovox.frame import AnyFrame, name_of
+from stereovox.frame import AnyFrame, UpdateReport, name_of
+from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.kernels.threads import expecting
 from stereovox.sources.base import Stream, closing
-from stereovox.track.fit import LOST, deviations
-from stereovox.track.tracker import POSE_FAULTS, Tracked
+from stereovox.track.fit import LOST, RIGID, deviations
+from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
+
+
+@dataclass(frozen=True)
+class TrackingGap:
+    """Consecutive frames without a pose.
+
+    Attributes:
+        first: Index of the first frame, from 0.
+        last: Index of the last frame.
+        begin_ns: Time of the first frame in nanoseconds.
+        end_ns: Time of the last frame.
+        why: Why the first frame was lost, in words.
+    """
+
+    first: int
+    last: int
+    begin_ns: int
+    end_ns: int
+    why: str
+
+    def __len__(self) -> int:
+        return self.last - self.first + 1
+
+    def line(self) -> str:
+        """Return one line for a user."""
+        if self.first == self.last:
+            return f"lost in frame {self.first}: {self.why}"
+        seconds = (self.end_ns - self.begin_ns) / 1e9
+        return f"lost from frame {self.first} to {self.last} ({seconds:.1f} s): {self.why}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the span for JSON."""
+        return asdict(self)
+
+
+class LostSpans:
+    """Collects the tracking gaps of a run, frame by frame; can observe a mapping run.
+
+    Args:
+        number: Index of the first frame.
+
+    Attributes:
+        spans: The spans so far.
+        frames: Number of frames so far.
+    """
+
+    def __init__(self, number: int = 0):
+        self.spans: list[TrackingGap] = []
+        self.frames, self._number = 0, number
+
+    @property
+    def lost(self) -> int:
+        """Number of frames that were lost so far."""
+        return sum(map(len, self.spans))
+
+    def add(self, stamp_ns: int, why: str) -> None:
+        """Record the next frame; `why` is empty if it was tracked."""
+        number = self._number + self.frames
+        self.frames += 1
+        if not why:
+            return
+        if self.spans and self.spans[-1].last == number - 1:
+            self.spans[-1] = replace(self.spans[-1], last=number, end_ns=stamp_ns)
+        else:
+            self.spans.append(TrackingGap(number, number, stamp_ns, stamp_ns, why))
+
+    def after(self, frame: AnyFrame, report: UpdateReport) -> None:
+        """Record a frame that was offered to the map; a frame with a fault was not tracked."""
+        self.add(frame.stamp_ns, report.detail if frame.fault else "")
+
+
+NO_START = "no frame so far has a pose of its own, at which the map could begin"
+
+
+class GuidedTracker:
+    """A tracker that predicts motion from the frames' own poses and corrects it by registration to known surfaces.
+
+    Its world starts as the world of the frames' own poses and departs from it as they drift. A frame without a pose
+    is tracked by its image alone.
+
+    Args:
+        config: Settings by which depth is prepared, as for the map.
+
+    Attributes:
+        prior_only_frames: Frames placed by their own motion alone, because nothing known was in view.
+    """
+
+    def __init__(self, config: Config):
+        self.prior_only_frames = 0
+        self._config, self._tracker = config, Tracker(config)
+        self._T_world_tracker: Transform | None = None
+        self._own: Transform | None = None  # own pose of the last frame the tracker used
+        self._at = np.full((4, 4), np.nan)
+
+    def add(self, frame: AnyFrame) -> Tracked:
+        """Return the pose of a frame, as `Tracker.add`.
+
+        Args:
+            frame: Depth image or stereo pair, with its own pose; a pose that is not rigid counts as missing.
+        """
+        own = _own_pose(frame)
+        if own is None and self._T_world_tracker is None:
+            return Tracked(self._at, np.full((6, 6), np.inf), NO_START)
+        known = None if own is None or self._own is None else inverse(self._own) @ own
+        tracked = self._tracker.add(frame, known)
+        if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image was unusable
+            self._at, self._own = tracked.T_world_sensor, own
+            if own is None and self._T_world_tracker is not None and not tracked.lost:
+                self._own = self._T_world_tracker @ tracked.T_world_sensor
+        self.prior_only_frames += tracked.believed
+        if tracked.begins:
+            self._begin(own)
+        if self._T_world_tracker is None:
+            return replace(tracked, lost=NO_START)
+        return tracked.moved(self._T_world_tracker)
+
+    def expect(self, frame: AnyFrame) -> None:
+        """Start to prepare the next frame, as `Tracker.expect`."""
+        self._tracker.expect(frame)
+
+    def picture_use(self) -> str:
+        """Return how the color images were used so far, in words; "" if there are none."""
+        return self._tracker.picture_use()
+
+    def _begin(self, own: Transform | None) -> None:
+        """Place the tracker's world by the own pose of the image that its map began with."""
+        self._own = own
+        self._T_world_tracker = None if own is None else own @ inverse(self._at)
+        if own is None:
+            self._tracker, self._at = Tracker(self._config), np.full((4, 4), np.nan)
+
+
+def _own_pose(frame: AnyFrame) -> Transform | None:
+    T = frame.T_world_sensor
+    return orthonormalise(np.asarray(T, float)) if T is not None and rigidity_error(T) < RIGID else None
+
 
 FrameT = TypeVar("FrameT", bound=AnyFrame)
 CURE = "move slower, or back to what was seen before"

@@ -497,7 +497,7 @@ class Tracker:
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
     """Return the evidence that tracks a camera."""
     if isinstance(frame, StereoFrame) and isinstance(frame.pair.camera, PinholeCamera):
-        from stereovox.track.pairs import Pairs  # needs OpenCV
+        from stereovox.track.landmarks import Pairs  # needs OpenCV
 
         return Pairs(frame.pair)
     return Surfaces(config)

@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from stereovox.geometry.se3 import Transform, inverse, rotation_matrix, rotation_vector
-from stereovox.track import _views
+from stereovox.track import _sightings
 
 GRID = (30, 40)
 """Rows and columns of a view's depths."""
@@ -69,7 +69,7 @@ def stood_free(
     """
     free = np.zeros(len(points), bool)
     for view in nearest_views(views, T, FEW):
-        _views.stood_free(points, sigma, *_into(view, T), view.nearest, DEVIATIONS, SLACK, free)
+        _sightings.stood_free(points, sigma, *_into(view, T), view.nearest, DEVIATIONS, SLACK, free)
     return free
 
 
@@ -151,7 +151,7 @@ def _seen_through(one: View, other: View, deviations: float, step: int = 1) -> t
     """Return how many of every `step`th point of one view the other looks through, and how many it confirms."""
     found = np.zeros(2, np.int64)
     into = _into(other, one.T)
-    _views.seen_through(one.points, one.sigma, *into, other.depth, np.float32(deviations), SLACK, step, found)
+    _sightings.seen_through(one.points, one.sigma, *into, other.depth, np.float32(deviations), SLACK, step, found)
     return int(found[0]), int(found[1])
 
 

@@ -14,11 +14,8 @@ from stereovox.maps import VoxelMap
 from stereovox.products.floor_axes import upright_axes
 from stereovox.view.drawn import checked_up
 from stereovox.viewer.cameras import Cameras, as_tuple, first_look, up_vector
-from stereovox.viewer.cells import Cells
-from stereovox.viewer.chunks import MAX_CELLS
-from stereovox.viewer.layer import LayerPlane
-from stereovox.viewer.measure import Measure
-from stereovox.viewer.panel import axis_chart, colour_bar, plain, statistics
+from stereovox.viewer.cells import MAX_CELLS, Cells
+from stereovox.viewer.panel import LayerPlane, Measure, axis_chart, colour_bar, plain, statistics
 from stereovox.viewer.serve import HERE, PORT, Guard, checked_token, find_address, new_token, serve, stop, url_of
 
 if TYPE_CHECKING:

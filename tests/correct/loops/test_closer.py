@@ -9,8 +9,8 @@ from made_loops import OFFICES, RING, bare_closer, closed, errors, mapped, off, 
 
 from stereovox.config import load_config
 from stereovox.correct.loops.closer import Loop, LoopCloser
-from stereovox.correct.loops.matching import FLOOR, Match
-from stereovox.correct.loops.repeats import Repeats
+from stereovox.correct.loops.search import Repeats
+from stereovox.correct.loops.submaps import FLOOR, Match
 from stereovox.geometry.se3 import inverse, rotation_matrix
 
 

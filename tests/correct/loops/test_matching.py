@@ -5,7 +5,7 @@ import numpy as np
 from made_loops import RING, closed, truths
 
 from stereovox.correct.loops.drift import difference
-from stereovox.correct.loops.matching import _seen_from, matched
+from stereovox.correct.loops.submaps import _seen_from, matched
 from stereovox.geometry.se3 import inverse, rotation_matrix
 from stereovox.track.fit import _moved, motion_between
 

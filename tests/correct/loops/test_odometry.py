@@ -7,8 +7,7 @@ from made_loops import ELSEWHERE, blind, follow, off, truths
 
 from stereovox.config import load_config
 from stereovox.correct.loops.closer import LoopCloser
-from stereovox.correct.loops.drift import difference, moved_by
-from stereovox.correct.loops.odometry import MAX_OFF_M, Odometry
+from stereovox.correct.loops.drift import MAX_OFF_M, Odometry, difference, moved_by
 from stereovox.errors import StereovoxError
 from stereovox.geometry.pose_graph import information
 from stereovox.geometry.se3 import rotation_matrix

@@ -11,7 +11,7 @@ from made_loops import ELSEWHERE, blind, follow, off, truths
 from stereovox.config import load_config
 from stereovox.correct.close_loops import _positions
 from stereovox.correct.loops.closer import LoopCloser
-from stereovox.correct.loops.positions import Positions
+from stereovox.correct.loops.drift import Positions
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import rotation_matrix
 from stereovox.simulate.simulation import Simulation

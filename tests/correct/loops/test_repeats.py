@@ -4,7 +4,7 @@
 import numpy as np
 from made_loops import RACKS, RING, closed, errors, truths
 
-from stereovox.correct.loops import repeats
+from stereovox.correct.loops import search
 
 BAY = 1.2
 ALLOWED = 0.05
@@ -31,6 +31,6 @@ def test_a_wrong_bay_is_refused_and_told(monkeypatch):
     truth = truths(closer, RACKS)
     assert not closer.loops or errors(closer.loops, truth).max() < 0.3
     assert sum("looks the same 1.2" in loop.why or "looks the same 1.1" in loop.why for loop in closer.refused) > 3
-    monkeypatch.setattr(repeats, "SEEN_BY", 10**6)
+    monkeypatch.setattr(search, "SEEN_BY", 10**6)
     believing = closed.__wrapped__(RACKS, drift=ALLOWED)
     assert errors(believing.loops, truth).max() > 1.0

@@ -7,7 +7,7 @@ from made_loops import bare_closer
 
 from stereovox.config import load_config
 from stereovox.correct.loops.closer import Loop
-from stereovox.correct.loops.matching import FLOOR, Match
+from stereovox.correct.loops.submaps import FLOOR, Match
 from stereovox.errors import ConfigError
 from stereovox.geometry.se3 import inverse, rotation_matrix
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes, StereoPair
+from stereovox.cameras.wide import Lens
 from stereovox.config import load_config
 from stereovox.depth.sphere import range_in, sight_of
 from stereovox.depth.sphere.vehicle import vehicle_grid

@@ -10,10 +10,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes, StereoPair
-from stereovox.depth.stereo.rectify import rectified
+from stereovox.cameras.wide import Lens
+from stereovox.depth.stereo.pipeline import rectified
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import StereoFrame
 from stereovox.geometry.se3 import inverse, rotation_matrix, transform_points
@@ -148,7 +148,7 @@ def test_points_seen_by_both_lie_on_one_row_and_give_their_depth(model):
     depth = rng.uniform(0.6, 9, 400)
     columns, rows = (part.astype(float) for part in camera.rays())
     points = depth[:, None] * np.column_stack([columns[u], rows[v]])
-    from stereovox.depth.stereo.rectify import _prepared
+    from stereovox.depth.stereo.pipeline import _prepared
 
     left, right, _ = _prepared(pair)
     in_left = transform_points(pair.T_body_camera, points)

@@ -7,7 +7,7 @@ import pytest
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.config import NoiseConfig
-from stereovox.depth.stereo.reproject import depth_sigma, point_sigma, reproject
+from stereovox.depth.stereo.disparity import depth_sigma, point_sigma, reproject
 from stereovox.sensors.noise import RangeNoise
 
 BASELINE = 0.15

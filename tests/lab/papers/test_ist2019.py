@@ -14,9 +14,8 @@ from made_pages import Balanced
 
 from stereovox.cli import main
 from stereovox.formats.map_server import read_map_server
-from stereovox.localize.slam.doubts import MapDoubt
-from stereovox.simulate.floors.bag import write_bag
-from stereovox.simulate.floors.floor import Floor
+from stereovox.localize.slam.graph import MapDoubt
+from stereovox.simulate.floors.floor import Floor, write_bag
 from stereovox_lab.papers import ist2019, reproduce
 from stereovox_lab.papers.ist.claims import claims_of, fan_claims, numbers_of
 from stereovox_lab.papers.ist.drives import PLACES, Drive, Extent, record

@@ -2,7 +2,7 @@
 import numpy as np
 
 from stereovox.geometry import se2
-from stereovox.localize.amcl.models import distance_field
+from stereovox.localize.amcl.particles import distance_field
 from stereovox.maps.occupancy import OccupancyGrid
 
 

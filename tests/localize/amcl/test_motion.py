@@ -4,7 +4,7 @@ import pytest
 
 from stereovox.config.robot import AmclConfig
 from stereovox.geometry import se2
-from stereovox.localize.amcl.models import moved, turn_go_turn
+from stereovox.localize.amcl.particles import moved, turn_go_turn
 
 NOISY = AmclConfig(alpha1=0.02, alpha2=0.005, alpha3=0.004, alpha4=0.006)
 SURE = AmclConfig(alpha1=0, alpha2=0, alpha3=0, alpha4=0)

@@ -8,8 +8,8 @@ from stereovox.config.robot import AmclConfig
 from stereovox.frame import Scan
 from stereovox.geometry import se2
 from stereovox.localize.amcl import _amcl
-from stereovox.localize.amcl.models import BeamModel, FieldModel, beam_likelihood, distance_field
-from stereovox.localize.scan_beams import beams_of
+from stereovox.localize.amcl.particles import BeamModel, FieldModel, beam_likelihood, distance_field
+from stereovox.localize.track import beams_of
 from stereovox.maps.occupancy import OccupancyGrid
 
 CONFIG = AmclConfig(z_hit=0.6, z_short=0.2, z_max=0.05, z_rand=0.15, sigma_hit=0.15, lambda_short=0.4)

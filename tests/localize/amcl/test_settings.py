@@ -11,7 +11,7 @@ from stereovox.config.robot import AmclConfig
 from stereovox.frame import Scan
 from stereovox.geometry import se2
 from stereovox.localize.amcl.localise import Localiser
-from stereovox.localize.scan_beams import beams_of
+from stereovox.localize.track import beams_of
 from stereovox.simulate.floors.plan import FloorPlan, block
 from stereovox.simulate.floors.view import cast
 

@@ -9,9 +9,8 @@ from made_drives import along, box, drive, ring
 
 from stereovox.config import load_config
 from stereovox.geometry import se2
-from stereovox.localize.slam.doubts import BENT, CONTRADICTED, MapDoubt, doubts_of
+from stereovox.localize.slam.graph import BENT, CONTRADICTED, SLIPPED_SCALE, MapDoubt, OdometryCheck, doubts_of, through
 from stereovox.localize.slam.line_map import Cloud
-from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, OdometryCheck, through
 from stereovox.localize.slam.pipeline import Slam, map_scans
 
 

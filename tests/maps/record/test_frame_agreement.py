@@ -7,7 +7,7 @@ import pytest
 from stereovox.config import load_config
 from stereovox.maps import VoxelMap
 from stereovox.maps.cells.evidence import Evidence
-from stereovox.maps.record import glance as frame_agreement
+from stereovox.maps.record import glance
 from stereovox.maps.record.glance import FEW, KNOWN, SEEN_THROUGH, Agreement
 
 FIRM = 1600
@@ -74,7 +74,7 @@ def test_weights_are_those_of_plain_python(cell, seed):
 def test_the_sample_of_many_blocks_is_fair_and_does_not_depend_on_their_order(monkeypatch):
     voxel_map, evidence = made("int16", blocks=200)
     whole = voxel_map.storage.agreement(evidence, FIRM)
-    monkeypatch.setattr(frame_agreement, "SAMPLE", 60)
+    monkeypatch.setattr(glance, "SAMPLE", 60)
     some = voxel_map.storage.agreement(evidence, FIRM)
     assert some != whole
     np.testing.assert_allclose(some, whole, rtol=0.35)

@@ -8,8 +8,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_robot
-from stereovox.simulate.floors.bag import write_bag
-from stereovox.simulate.floors.floor import Floor
+from stereovox.simulate.floors.floor import Floor, write_bag
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 

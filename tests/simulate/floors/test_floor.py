@@ -14,9 +14,8 @@ from stereovox.geometry import se2
 from stereovox.geometry.se3 import inverse, rigidity_error, transform_points
 from stereovox.opening import open_robot
 from stereovox.sensors.noise import RangeNoise
-from stereovox.simulate.floors.drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
+from stereovox.simulate.floors.drive import STEP_NS, Kinect, Odometry, Stop, drive, kinect_camera, metres, zigzag
 from stereovox.simulate.floors.floor import PLANS, Floor
-from stereovox.simulate.floors.kinect import Kinect, kinect_camera
 
 SMALL = "image_width=80"
 DRIVES = ("sim:floor", "sim:floor?shut=1", "sim:floor?plan=testbed")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stereovox.geometry import se2
+from stereovox.simulate.floors.drive import kinect_camera
 from stereovox.simulate.floors.floor import Floor
-from stereovox.simulate.floors.kinect import kinect_camera
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, block, post
 from stereovox.simulate.floors.view import LevelView
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.calibrate.noise import NoiseAt, NoiseCalibration
-from stereovox.calibrate.recording import read_wall
+from stereovox.calibrate.surface import read_wall
 from stereovox.calibrate.wall import calibrate_wall
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import StereovoxError

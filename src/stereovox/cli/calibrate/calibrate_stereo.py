@@ -40,8 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Calibrate, write the rig file and print how well it fits."""
-    from stereovox.calibrate.chessboard import unmatched
-    from stereovox.calibrate.stereo import calibrate_stereo, check_model, read_boards
+    from stereovox.calibrate.stereo import calibrate_stereo, check_model, read_boards, unmatched
 
     board = _board(arguments.board, arguments.square)
     check_model(arguments.lens)
@@ -61,7 +60,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _board(text: str, square: float) -> Any:
-    from stereovox.calibrate.chessboard import Board
+    from stereovox.calibrate.stereo import Board
 
     try:
         columns, rows = (int(word) for word in text.lower().split("x"))

@@ -234,11 +234,11 @@ COMPARE = {2: _compare_grids, 3: _compare_cells}
 
 
 def _print_decisions(scores: Scores) -> None:
-    from stereovox.evaluate import decisions as words
+    from stereovox.evaluate import decisions
 
-    say_table(words.HEADS, words.state_rows(scores.decisions))
-    say_table(words.ERROR_HEADS, words.error_rows(scores.decisions, scores.tolerance_cells))
-    say_table(words.PART_HEADS, words.part_rows(scores.parts))
+    say_table(decisions.HEADS, decisions.state_rows(scores.decisions))
+    say_table(decisions.ERROR_HEADS, decisions.error_rows(scores.decisions, scores.tolerance_cells))
+    say_table(decisions.PART_HEADS, decisions.part_rows(scores.parts))
 
 
 def _print_scores(scores: Scores) -> None:

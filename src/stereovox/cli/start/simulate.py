@@ -25,7 +25,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Write the bag and print what it contains."""
-    from stereovox.simulate.floors.bag import write_bag
+    from stereovox.simulate.floors.floor import write_bag
 
     out = check_file(arguments.out, (".bag", ".mcap", ".db3"))
     robot = open_noting(arguments.source)

@@ -17,13 +17,9 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.lidar import Lidar
 from stereovox.config import Config
-from stereovox.correct.loops.drift import GATE, Drift, PathLength, difference, squared
-from stereovox.correct.loops.matching import FLOOR, Match, matched
-from stereovox.correct.loops.odometry import Odometry
-from stereovox.correct.loops.positions import Positions
-from stereovox.correct.loops.repeats import Repeats
-from stereovox.correct.loops.search import SAME_M, SAME_RAD, Search
-from stereovox.correct.loops.submaps import Shape, Shapes, Submap, is_long
+from stereovox.correct.loops.drift import GATE, Drift, Odometry, PathLength, Positions, difference, squared
+from stereovox.correct.loops.search import SAME_M, SAME_RAD, Repeats, Search
+from stereovox.correct.loops.submaps import FLOOR, Match, Shape, Shapes, Submap, is_long, matched
 from stereovox.errors import StereovoxError
 from stereovox.geometry.pose_graph import HELD, Edge, PoseGraph, Position, Upright, information, need_gtsam
 from stereovox.geometry.se3 import Transform, interpolate, inverse, orthonormalise, rotation_between

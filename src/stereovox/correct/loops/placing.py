@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from stereovox.correct.loops.closer import Loop, LoopCloser
 from stereovox.correct.loops.drift import difference
-from stereovox.correct.loops.matching import matched
 from stereovox.correct.loops.search import Peak, Search, apart
+from stereovox.correct.loops.submaps import matched
 from stereovox.errors import StereovoxError
 from stereovox.geometry.se3 import Transform, inverse
 from stereovox.track.views import View

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.cameras.wide import WIDEST_DEG, SphericalCamera
 from stereovox.config import Config
-from stereovox.depth.sphere.grid import SphereGrid, accumulate
-from stereovox.depth.sphere.layout import SphereLayout
+from stereovox.depth.sphere.grid import SphereGrid, SphereLayout, accumulate
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
 from stereovox.geometry.se3 import Transform, inverse

@@ -10,8 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.depth.sphere.grid import SphereGrid
-from stereovox.depth.sphere.layout import SphereLayout
+from stereovox.depth.sphere.grid import SphereGrid, SphereLayout
 from stereovox.errors import StereovoxError
 from stereovox.frame import Reason
 

@@ -17,7 +17,7 @@ MATCHERS = {
     "sgm8": "stereovox.depth.stereo.opencv:EightWay",
     "hh4": "stereovox.depth.stereo.opencv:FourWay",
     "block": "stereovox.depth.stereo.opencv:Block",
-    "onnx": "stereovox.depth.stereo.onnx:Network",
+    "onnx": "stereovox.depth.stereo.opencv:Network",
 }
 
 

@@ -22,10 +22,8 @@ from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceErro
 from stereovox.frame import Scan, name_of
 from stereovox.frame.validate import validate_scan
 from stereovox.geometry import se2
-from stereovox.localize.amcl.models import MODELS, moved, turn_go_turn
-from stereovox.localize.amcl.particles import Clusters, Recovery, draw, mean_pose, spread
-from stereovox.localize.scan_beams import Beams, beams_of
-from stereovox.localize.track import Track
+from stereovox.localize.amcl.particles import MODELS, Clusters, Recovery, draw, mean_pose, moved, spread, turn_go_turn
+from stereovox.localize.track import Beams, Track, beams_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 

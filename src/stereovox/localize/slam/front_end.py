@@ -8,10 +8,17 @@ import numpy as np
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
 from stereovox.geometry import se2
-from stereovox.localize.slam.graph import SLACK_TURN, Keyframe
+from stereovox.localize.slam.graph import (
+    SLACK_TURN,
+    SLIPPED_SCALE,
+    STUCK_SCALE,
+    Keyframe,
+    Moment,
+    OdometryCheck,
+    through,
+)
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
 from stereovox.localize.slam.loops import ClosureSearch
-from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, STUCK_SCALE, Moment, OdometryCheck, through
 
 STEP_YAW = 0.01
 """Radians between the yaw angles that the search tries."""

@@ -23,9 +23,8 @@ from stereovox.frame import Progress, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.pose_graph import Edge, PoseGraph
 from stereovox.integrate.beams import make_beams
-from stereovox.localize.slam.doubts import MapDoubt, doubts_of
 from stereovox.localize.slam.front_end import Follower
-from stereovox.localize.slam.graph import Keyframe, in_map, patch_edges, step_edges
+from stereovox.localize.slam.graph import Keyframe, MapDoubt, doubts_of, in_map, patch_edges, step_edges
 from stereovox.localize.slam.loops import LoopFinder
 from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from stereovox.config import MapConfig
 from stereovox.kernels.threads import in_shards, shards
 from stereovox.maps.cells import _add, _pool
-from stereovox.maps.cells import _pool as _times
 from stereovox.maps.cells.cell_format import CellRules
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.storage.blocks import CELLS, BlockPool, StoredCells, table_size
@@ -237,7 +236,7 @@ UNIT_NS = 10_000_000
 FIRST, LAST = 1 << 30, (1 << 32) - 1
 """The stored time of the map's first frame, and the largest one. Times from 124 days before to 373 days after the first
 frame can be stored; others are clamped to that range."""
-NEVER = int(_times.NEVER)
+NEVER = int(_pool.NEVER)
 LATE = 8
 """A cell is forgotten at most `forget_s` / LATE after its time is over."""
 
@@ -250,7 +249,7 @@ class CellTimes:
 
     def __init__(self, config: MapConfig, capacity: int = 256):
         self.start_ns: int | None = None
-        self._forget_ns = None if config.forget_s is None else max(ceil(config.forget_s * 1e9), LATE * _times.SLOTS)
+        self._forget_ns = None if config.forget_s is None else max(ceil(config.forget_s * 1e9), LATE * _pool.SLOTS)
         self._blocks = BlockPool(np.uint32, capacity)
         self._has_written = self._has_forgotten = False  # at first all kernels are called, so that none compiles later
 
@@ -281,7 +280,7 @@ class CellTimes:
     def missing(self, evidence: Evidence) -> int:
         """Return how many blocks `write` would create."""
         blocks = self._blocks
-        return _times.missing(blocks.table, blocks.coords, evidence.coords, evidence.values, evidence.uniform)
+        return _pool.missing(blocks.table, blocks.coords, evidence.coords, evidence.values, evidence.uniform)
 
     def write(self, evidence: Evidence, stamp_ns: int) -> None:
         """Record when cells got evidence; times count from the first frame."""
@@ -290,7 +289,7 @@ class CellTimes:
         blocks, first, self._has_written = self._blocks, not self._has_written, True
         if first or len(blocks) + len(evidence.coords) + len(evidence.uniform) > len(blocks.coords):
             blocks.reserve(self.missing(evidence))
-        _times.write(*self._arrays, evidence.coords, evidence.values, evidence.uniform, self.steps(stamp_ns))
+        _pool.write(*self._arrays, evidence.coords, evidence.values, evidence.uniform, self.steps(stamp_ns))
 
     def get(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
         """Return the times (n, 512) of blocks (n, 3), NEVER if there are none."""
@@ -311,11 +310,11 @@ class CellTimes:
 
     def remove(self, coords: NDArray[np.int32]) -> None:
         """Remove the times of blocks (n, 3), whether present or not."""
-        _times.remove_times(*self._arrays, np.ascontiguousarray(coords, np.int32))
+        _pool.remove_times(*self._arrays, np.ascontiguousarray(coords, np.int32))
 
     def follow(self, cells: CellPool, low: NDArray[np.int32], high: NDArray[np.int32]) -> None:
         """Remove the times of blocks that touch cells [low, high) and are no longer in `cells`."""
-        _times.follow(*self._arrays, cells.table, cells.coords, low, high)
+        _pool.follow(*self._arrays, cells.table, cells.coords, low, high)
 
     def seconds_ago(self, times: NDArray[np.uint32], now_ns: int) -> NDArray[np.float32]:
         """Return the ages of times, in seconds; negative if later than now, NaN for NEVER."""
@@ -329,11 +328,11 @@ class CellTimes:
         """
         if self._forget_ns is None:
             return
-        turn_ns = self._forget_ns // (LATE * _times.SLOTS)
+        turn_ns = self._forget_ns // (LATE * _pool.SLOTS)
         before, now = before_ns // turn_ns, now_ns // turn_ns
         if now > before or not self._has_forgotten:
             self._has_forgotten = True
-            self._forget_in_turns((before + 1) % _times.SLOTS, max(0, min(now - before, _times.SLOTS)), cells, now_ns)
+            self._forget_in_turns((before + 1) % _pool.SLOTS, max(0, min(now - before, _pool.SLOTS)), cells, now_ns)
 
     def expired(self, times: NDArray[np.integer], now_ns: int) -> NDArray[np.bool_]:
         """Return which times expired: more than `forget_s` before now, or after it, as when a clock was reset."""
@@ -345,7 +344,7 @@ class CellTimes:
     def _forget_in_turns(self, first: int, turns: int, cells: CellPool, now_ns: int) -> None:
         blocks = self._blocks
         places = np.empty(len(blocks), np.int64)
-        number = _times.due(
+        number = _pool.due(
             blocks.coords, blocks.values, blocks.count, first, turns, self.steps(now_ns), self._most, places
         )
         coords = blocks.coords[places[:number]]

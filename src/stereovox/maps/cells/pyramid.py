@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pyramid of a map in boxes: levels of cells twice as large, so that all of a big map can be shown.
 
-A coarse cell has the worst state of its eight parts, as in `products.edit.coarsen`: it is free only if all of them are.
+A coarse cell has the worst state of its eight parts, as in `edit.coarsen`: it is free only if all of them are.
 """
 
 from __future__ import annotations

@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps.cells.cell_format import CellRules, State, Thresholds
 from stereovox.maps.query import _query, _query_solids
-from stereovox.maps.query import _query as _query_nearest
-from stereovox.maps.query import _query as _query_rays
 from stereovox.maps.storage.blocks import StoredCells
 
 INDEX_LIMIT = 2**30
@@ -115,7 +113,7 @@ def cast_rays(
         raise StereovoxError(f"direction {np.flatnonzero(~directions.any(axis=1))[0]} is (0, 0, 0) and leads nowhere")
     n, wanted = len(directions), state_bits(stop_at, "stop_at")
     hits = RayHits.none(n)
-    _query_rays.cast(*_read(asked), wanted, asked.sides, origins, directions, distance_of(max_distance), *hits)
+    _query.cast(*_read(asked), wanted, asked.sides, origins, directions, distance_of(max_distance), *hits)
     return hits
 
 
@@ -147,7 +145,7 @@ def nearest(asked: QueryTarget, points: ArrayLike, max_distance: float, obstacle
     points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), state_bits(obstacles, "obstacles")
     n = len(points)
     found = NearestCells.none(n)
-    _query_nearest.nearest(*_read(asked), wanted, asked.sides, points, distance_of(max_distance), *found)
+    _query.nearest(*_read(asked), wanted, asked.sides, points, distance_of(max_distance), *found)
     return found
 
 

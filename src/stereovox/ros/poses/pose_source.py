@@ -13,8 +13,8 @@ from stereovox.formats.map_server import read_map_server
 from stereovox.localize.robot_track import doubt_lines, parse_start, refused_line
 from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, RangeInput, RaysInput, ScanInput
-from stereovox.ros.map_server import MapServer
 from stereovox.ros.options import SLAM, Options, split_pair
+from stereovox.ros.outputs import MapServer
 from stereovox.ros.poses.localization import (
     LocalizedPoses,
     Localizer,
@@ -23,11 +23,10 @@ from stereovox.ros.poses.localization import (
     MapLocalization,
     SlamLocalization,
 )
-from stereovox.ros.poses.location_topics import InitialPose, LocationTopics
-from stereovox.ros.poses.motion import Late, MotionPublisher, never_late
+from stereovox.ros.poses.location_topics import InitialPose, Late, LocationTopics, MotionPublisher, never_late
 from stereovox.ros.poses.poses import PoseBuffer
 from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses, Tracking
-from stereovox.runs.pose_choice import GIVEN, TRACK
+from stereovox.runs.warm_up import GIVEN, TRACK
 
 SLAM_MAP_S = 2.0
 """Least seconds between two maps of SLAM."""

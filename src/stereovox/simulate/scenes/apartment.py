@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from stereovox.geometry.se3 import transform_points
+from stereovox.simulate.flight import walk
 from stereovox.simulate.scene import Point, Scene, Solid, box, cylinder
 from stereovox.simulate.stage import SHIFT, Face, Stage, moved, rectangle, within
-from stereovox.simulate.walking import walk
 
 HZ = 15.0
 """Images a second: the rate at which Chien 2020 wanted to map."""

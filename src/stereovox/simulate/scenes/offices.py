@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
 from stereovox.geometry.se3 import Transform, transform_points
-from stereovox.simulate import walking
+from stereovox.simulate import flight
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.scene import Point, Scene, Solid, box, cylinder
 from stereovox.simulate.scenes.apartment import chair
@@ -94,7 +94,7 @@ def stage(*, offices: int = 8, visits: int = 10, walk: int = 0, speed: float = 1
     within("walk", walk, 0, 2**31)
     within("speed", speed, 0.1, 2)
     waypoints = _waypoints(offices, visits, np.random.default_rng(walk))
-    path, seconds = walking.walk(waypoints, speed, TURN_DEG)
+    path, seconds = flight.walk(waypoints, speed, TURN_DEG)
     T_world_plan = np.eye(4)
     T_world_plan[:3, 3] = SHIFT
     return Stage(

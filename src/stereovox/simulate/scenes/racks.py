@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.simulate import walking
+from stereovox.simulate import flight
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.scene import Scene, Solid, box
 from stereovox.simulate.stage import SHIFT, Stage, moved, within
@@ -35,7 +35,7 @@ def stage(*, bays: int = 24, bay: float = 1.2, passes: int = 3, walk: int = 0, s
     within("speed", speed, 0.1, 3)
     T_world_plan = np.eye(4)
     T_world_plan[:3, 3] = SHIFT
-    path, seconds = walking.walk(_waypoints(bays * bay, passes, np.random.default_rng(walk)), speed)
+    path, seconds = flight.walk(_waypoints(bays * bay, passes, np.random.default_rng(walk)), speed)
     return Stage(
         lambda: moved(Scene(_hall(bays, bay)), T_world_plan),
         lambda share: T_world_plan @ path(share),

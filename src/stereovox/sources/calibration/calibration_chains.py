@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import Lens
 from stereovox.errors import SourceError
 from stereovox.files.safe_io import shown
 from stereovox.geometry.se3 import Transform, inverse

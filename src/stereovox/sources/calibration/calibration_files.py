@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.cameras.lenses import MODELS, Lens
+from stereovox.cameras.wide import MODELS, Lens
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.files.safe_io import read_text
 from stereovox.geometry.se3 import inverse

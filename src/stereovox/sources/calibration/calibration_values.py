@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import MODELS, Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import MODELS, Lens
 from stereovox.errors import SourceError
 from stereovox.files.safe_io import MAX_YAML, read_text, shown, yaml_value
 from stereovox.geometry.se3 import Transform, inverse, orthonormalise, rigidity_error

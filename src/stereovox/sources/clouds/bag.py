@@ -14,7 +14,7 @@ from stereovox.cameras.lidar import RangeSensor
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Cloud, Range
-from stereovox.sensors.model import REACH_SIGMA
+from stereovox.sensors.protocol import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
 from stereovox.sources.bags.recording import PosedSensor, TurnedTf, file_part, read_poses

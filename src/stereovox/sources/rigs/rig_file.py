@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.lenses import COUNTS, Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes, StereoPair, VirtualCamera
-from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
+from stereovox.cameras.wide import COUNTS, CylindricalCamera, Lens, SphericalCamera
 from stereovox.errors import FrameRefused, SourceError, StereovoxError, did_you_mean
 from stereovox.files.safe_io import is_number, replacing, shown, toml_text
 from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error

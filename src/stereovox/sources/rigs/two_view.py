@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.cameras.lenses import Lens
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import Eyes
-from stereovox.config.depth import StereoConfig
+from stereovox.cameras.wide import Lens
+from stereovox.config.maps import StereoConfig
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.files.safe_io import read_text
 from stereovox.sources.base import Part

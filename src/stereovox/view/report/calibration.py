@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.calibrate.chessboard import read_grey
 from stereovox.calibrate.noise import NoiseCalibration
-from stereovox.calibrate.stereo import BoardPair, StereoCalibration
+from stereovox.calibrate.stereo import BoardPair, StereoCalibration, read_grey
 from stereovox.calibrate.wall import WallCalibration
 from stereovox.cameras.rigs import StereoPair
-from stereovox.depth.stereo.rectify import rectified
+from stereovox.depth.stereo.pipeline import rectified
 from stereovox.frame import StereoFrame
 from stereovox.view.calibration import DPI, WIDTH, noise_png, wall_png
 from stereovox.view.figures import GREY, blank, png_of, title

@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate import decisions as words
+from stereovox.evaluate import decisions
 from stereovox.evaluate.decisions import Outcomes
 from stereovox.evaluate.scores import Scores
 from stereovox.view.evaluation import curves_png, outcomes_png, series_png
@@ -144,13 +144,15 @@ def _decisions(one: Evaluated) -> Iterable[str]:
     yield page.section(
         f"What it decides: {one.name}",
         DECIDED,
-        page.table(words.HEADS, words.state_rows(found)),
+        page.table(decisions.HEADS, decisions.state_rows(found)),
         "<p></p>",
-        page.table(words.ERROR_HEADS, words.error_rows(found, tolerance)),
+        page.table(decisions.ERROR_HEADS, decisions.error_rows(found, tolerance)),
     )
     if one.scores.parts:
-        rows = words.part_rows(one.scores.parts)
-        yield page.section(f"By range, thickness and looks: {one.name}", BY_PARTS, page.table(words.PART_HEADS, rows))
+        rows = decisions.part_rows(one.scores.parts)
+        yield page.section(
+            f"By range, thickness and looks: {one.name}", BY_PARTS, page.table(decisions.PART_HEADS, rows)
+        )
 
 
 def _tables(results: Sequence[Evaluated]) -> Iterable[str]:

@@ -17,7 +17,7 @@ from stereovox.integrate import make_integrator
 from stereovox.maps import State, VoxelMap, make_map
 from stereovox.products.floor_axes import layer
 from stereovox.simulate.d435 import CAMERA
-from stereovox.simulate.scenes.plain_scenes import SIZES
+from stereovox.simulate.scenes.hall import SIZES
 from stereovox.simulate.simulation import OWN, SIMPLE, Simulation
 from stereovox.view.figures import INK, PATH_COLOUR, labels, title
 from stereovox.view.layer import draw_landscape, draw_plan, draw_profile

@@ -278,7 +278,7 @@ MUTANTS = (
            "Eq 4.1"),
     Mutant(VALENTI, "Eq 4.6 as printed: sin not times B", "stereovox.cameras.wide:SphericalCamera.depth_of",
            lambda original: lambda self, d, aligned="left": original(self, d, aligned) + 0.1, "Eq 4.3"),
-    Mutant(VALENTI, "Eq 4.2 and 4.7 twice as large", "stereovox.depth.stereo.reproject:depth_sigma", _scaled(2.0),
+    Mutant(VALENTI, "Eq 4.2 and 4.7 twice as large", "stereovox.depth.stereo.disparity:depth_sigma", _scaled(2.0),
            "Eq 4.2"),
     Mutant(VALENTI, "Eq 5.4 with + 3 sigma", "stereovox.depth.sphere.grid:_nearest", _plus_spread, GRID),
     Mutant(VALENTI, "stitching: the farthest wins", "stereovox.depth.sphere.grid:_nearer", _farther, "5.4"),

@@ -17,7 +17,7 @@ from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline, prepare
 from stereovox.depth.sphere.grid import SphereGrid, accumulate, stitch
-from stereovox.depth.stereo.reproject import point_sigma, reproject
+from stereovox.depth.stereo.disparity import point_sigma, reproject
 from stereovox.errors import StereovoxError
 from stereovox.evaluate import lidar_truth
 from stereovox.evaluate.scores import score

@@ -12,8 +12,7 @@ import numpy as np
 from stereovox.evaluate.grid_align import Rectangle
 from stereovox.geometry import se2
 from stereovox.opening import open_robot
-from stereovox.simulate.floors.bag import TRUTH, write_bag
-from stereovox.simulate.floors.floor import Floor
+from stereovox.simulate.floors.floor import TRUTH, Floor, write_bag
 from stereovox.sources.robots.robot import Robot
 
 

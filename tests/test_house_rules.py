@@ -23,13 +23,13 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 610,
-    "lines": 93_900,
+    "modules": 500,
+    "lines": 93_000,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,
     "modules of the laboratory": 86,
-    "lines of the laboratory": 12_850,
+    "lines of the laboratory": 12_810,
     "words of README and docs": 37_950,
 }
 """Budgets. Raising one needs a reason in CHANGELOG.md."""

@@ -24,7 +24,7 @@ COMMANDS = {
 
 MOST = {
     "modules": 500,
-    "lines": 93_000,
+    "lines": 93_220,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

@@ -68,7 +68,7 @@ class AslRig(RigSource):
     )
 
     def __init__(self, where: str | os.PathLike[str], posed: bool = True):
-        self.folder, options = folder_and_options(where, {"rectify": "", "imu": "", **POSES})
+        self.folder, options = folder_and_options(where, {"rectify": "", "imu": "", "max_gap": 0.0, **POSES})
         self._imu = None if checked_imu(str(where), options["imu"]) == "off" else IMU
         self.name = self.folder.resolve().name
         root = _root(str(self.folder))
@@ -88,7 +88,8 @@ class AslRig(RigSource):
             self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)
         except SourceError as error:
             raise SourceError(f"{root / EYES[0]}: {error}") from None
-        self.notes = (*self.notes, *left.notes, *right.notes)
+        note = getattr(poses, "note", "")
+        self.notes = (*self.notes, *left.notes, *right.notes, *([note] if note else []))
 
     def _read_poses(self, root: Path, left: _Images, T_body_left: Transform, options: Mapping[str, Any]) -> Poses:
         if options["poses"]:
@@ -97,6 +98,7 @@ class AslRig(RigSource):
             poses = _poses(root)
             _check_clocks(left, poses)
             self.up = "z" if any(os.path.isfile(root / name / DATA) for name in TRUTHS) else None
+        poses.max_gap_ns = round(options["max_gap"] * 1e9)
         return as_body(poses, T_body_left, options["axes"], options["invert"])
 
     def imu(self) -> ImuReadings | None:

@@ -72,8 +72,12 @@ class DepthTopic:
         found = set[int]()
         for i in range(len(self)):
             with suppress(FrameRefused):
-                found.add(self._time(i, read_picture(self._file, self.topic, i, self.topic))[0])
+                found.add(self.time_ns(i))
         return sorted(found)
+
+    def time_ns(self, i: int) -> int:
+        """Return the time of image `i` without its pixels; raises FrameRefused if it is unreadable."""
+        return self._time(i, read_picture(self._file, self.topic, i, self.topic))[0]
 
     def _time(self, i: int, picture: Picture) -> tuple[int, dict[str, str]]:
         """Return an image's time in nanoseconds, and its metadata."""

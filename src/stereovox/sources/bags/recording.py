@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
-from stereovox.geometry.se3 import Transform
+from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources import parameters
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
@@ -27,6 +27,7 @@ from stereovox.sources.base import DepthSource
 from stereovox.sources.imu import ImuReadings
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES, WORLDS, turned
+from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 from stereovox.sources.rigs.rig_options import poses_of_images
 
 STANDING = ("", "fixed")
@@ -46,6 +47,7 @@ class Options:
     imu: topic of the IMU (`sensor_msgs/Imu`), if there are several; `off` for none.
     scale: metres per unit (0: the file's, else millimetres); baseline: metres (0: the file's).
     max_gap: longest gap in seconds between poses that is bridged (0: 0.5 in /tf, else as smooth motion allows).
+    invert, poses_scale: for poses that map the world into the camera, and metres per unit; not for /tf.
     """
 
     depth: str = ""
@@ -59,6 +61,8 @@ class Options:
     scale: float = 0.0
     baseline: float = 0.0
     max_gap: float = 0.0
+    invert: bool = False
+    poses_scale: float = 1.0
 
     def __post_init__(self) -> None:
         for key, known in {"axes": tuple(AXES), "world": WORLDS, "pose": STANDING}.items():
@@ -72,6 +76,8 @@ class Options:
         for key in ("scale", "baseline", "max_gap"):
             if getattr(self, key) < 0:
                 raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
+        if not self.poses_scale > 0:
+            raise SourceError(f"poses_scale={self.poses_scale:g} must be above 0: metres per unit of the poses")
 
 
 class Bag(DepthSource):
@@ -116,12 +122,31 @@ class Bag(DepthSource):
             self._poses, self._missing, notes = read_poses(
                 self._file, options, PosedSensor(self._depth.frame_id, stamps_ns=self._depth.taken_ns)
             )
-        self.notes = (*self._file.notes, *self._depth.notes, *notes)
+        self.notes = (*self._file.notes, *self._depth.notes, *notes, *self._misfit(options))
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is, or by its name should be, such a file or folder; options may follow."""
         return bool(suffix_of(file_part(where)))
+
+    def _misfit(self, options: Options) -> tuple[str, ...]:
+        """Return a note if the poses do not fit the images."""
+        if self._poses is None or options.invert or options.poses_scale != 1:
+            return ()
+        poses, name = self._poses, str(self._file.path)
+
+        def read(i: int) -> NDArray[np.generic]:
+            return self._depth.image(i, name)[0]
+
+        try:
+            unit = self._scale or self._depth.image(0, name)[2]
+            images = Images(len(self), lambda i: poses.at(self._depth.time_ns(i)), lru_cache(12)(read), self.camera)
+            found = misfit(images, unit, unit, Reading())
+        except FrameRefused:  # reported when it is read
+            return ()
+        given = options.axes or (isinstance(poses, TurnedTf) and ("invert=" in found or "poses_scale=" in found))
+        cure = "; check that poses, camera and depth unit belong to these images"
+        return (found.partition("; try")[0] + cure if given and "; try" in found else found,) if found else ()
 
     @classmethod
     def depth_only(cls, where: str) -> Bag:
@@ -249,8 +274,8 @@ def read_poses(
     assumptions."""
     if options.poses not in file.types and (path := _file_of(options.poses, file.path)):
         poses, axes = poses_of_images(path, sensor.stamps_ns()), options.axes or "optical"
-        T = turned(poses.T_world_body, axes, options.world or "file")
-        return _limited(Poses(poses.stamps_ns, T, where=poses.where, faults=poses.faults), options), "", ()
+        found = poses.of(turned(_read_as(poses.T_world_body, options), axes, options.world or "file"))
+        return _limited(found, options), "", ((poses.note,) if poses.note else ())
     chained = bool(sensor.option) and not options.axes
     found = find_poses(file, options.poses, sensor.frame_id, options.world_frame, chained)
     if found.unmounted:
@@ -262,12 +287,20 @@ def read_poses(
     poses = found.poses
     notes = () if found.of_camera or options.axes else (found.assumed,)
     if isinstance(poses, TfPoses):
+        if options.invert or options.poses_scale != 1:
+            raise SourceError(f"{file.path}: invert= and poses_scale= are not for /tf; leave them out, or name ?poses=")
         if options.max_gap:
             poses.tf.limits = replace(poses.tf.limits, max_gap_s=options.max_gap)
         return TurnedTf(poses, axes, world), "", (*notes, *poses.tf.notes)
-    T = turned(poses.T_world_body, axes, world)
-    made = Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults)
-    return _limited(made, options), "", notes
+    found = poses.of(turned(_read_as(poses.T_world_body, options), axes, world))
+    return _limited(found, options), "", notes
+
+
+def _read_as(T: NDArray[np.float64], options: Options) -> NDArray[np.float64]:
+    """Return poses (N, 4, 4) in metres, of the body in the world."""
+    T = np.array([inverse(one) for one in T]) if options.invert else T.copy()
+    T[:, :3, 3] *= options.poses_scale
+    return T
 
 
 def _limited(poses: Poses, options: Options) -> Poses:

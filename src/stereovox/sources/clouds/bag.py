@@ -14,6 +14,7 @@ from stereovox.cameras.lidar import RangeSensor
 from stereovox.depth.cloud import deskewed
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Cloud, Range
+from stereovox.geometry.se3 import inverse
 from stereovox.sensors.protocol import REACH_SIGMA
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.recording import Options as PoseOptions
@@ -22,8 +23,10 @@ from stereovox.sources.bags.robot_messages import CLOUDS, LASER_SCAN, RANGE, Las
 from stereovox.sources.bags.scans import ScanTopics, check_topic
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
 from stereovox.sources.parameters import mounted
+from stereovox.sources.rgbd.pose_fit import CloudReading, clouds_misfit
 
 TOPICS = {"cloud": CLOUDS, "scan": (LASER_SCAN,), "range": (RANGE,)}
+POSES = ("poses", "world_frame", "invert", "poses_scale", "max_gap")
 MOUNT = "mount=x,y,z,yaw,pitch,roll of the lidar on it"
 
 
@@ -36,7 +39,7 @@ class Options(LidarOptions):
     separated by commas. silence_clears: 1 if a cone in which nothing was heard is free (`RangeSensor`). poses: topic or
     file of the lidar's poses, or of its body's; default: /tf.
     mount: where the lidar is on the posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians
-    (0,0,0: the poses are the lidar's). world_frame: as for depth images. deskew: 0 to treat the points of a cloud as
+    (0,0,0: the poses are the lidar's). world_frame, invert, poses_scale, max_gap: as for depth images. deskew: 0 to treat the points of a cloud as
     measured at once although they have times.
     """
 
@@ -46,6 +49,9 @@ class Options(LidarOptions):
     silence_clears: bool = False
     poses: str = ""
     mount: str = ""
+    invert: bool = False
+    poses_scale: float = 1.0
+    max_gap: float = 0.0
     world_frame: str = ""
     deskew: bool = True
 
@@ -81,12 +87,35 @@ class BagClouds(CloudSource):
         self.name, self.lidar = f"{Path(path).name} {topics}", self._options.lidar
         mount = mounted("mount", self._options.mount)
         self._T_body_lidar = np.eye(4) if mount is None else mount
-        options = PoseOptions(poses=self._options.poses, world_frame=self._options.world_frame)
+        options = PoseOptions(**{key: getattr(self._options, key) for key in POSES})
         sensor = PosedSensor(self._scans.frame_id, "" if self._options.mount else MOUNT, self._scans.taken_ns)
         self._poses, self._missing, notes = read_poses(self._file, options, sensor)
         self._refuse_world()
-        self.notes = (*self._file.notes, *notes, *self._scans.notes)
         self.posed = self._poses is not None
+        self.notes = (*self._file.notes, *notes, *self._scans.notes, *filter(None, [self._misfit(key)]))
+
+    def _misfit(self, key: str) -> str:
+        """Return a note if the poses do not fit the clouds."""
+        if self._poses is None or key == "range" or len(set(self._scans.frame_ids)) > 1:
+            return ""
+        tf = isinstance(self._poses, TurnedTf)
+        own = self._options
+        changed = tf or own.invert or own.poses_scale != 1
+        place = "x,y,z,yaw,pitch" if tf else "0,0,0,0,0"
+        now = CloudReading(known=("ros",), whole=not changed, place=place)
+        if own.mount:
+            now = now._replace(mount=tuple(self._T_body_lidar.ravel().tolist()))
+
+        def raw(i: int) -> np.ndarray:
+            message = self._scans.read(i)
+            T = self._pose_at(message.frame_id, message.stamp_ns)
+            return T @ inverse(self._T_body_lidar) if own.mount else T
+
+        def points(i: int) -> np.ndarray:
+            message = self._scans.read(i)
+            return message.points if isinstance(message, PointCloud) else cloud_of_scan(message).points
+
+        return clouds_misfit(points, raw, len(self), now)
 
     def _refuse_unused(self, where: str, key: str) -> None:
         """Raise SourceError for options that this kind of topic does not use."""

@@ -24,6 +24,7 @@ from stereovox.sources.point_files import read_points
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rgbd.pose_fit import CloudReading, clouds_misfit
 from stereovox.sources.rigs.rig_options import poses_of_images
 
 ENDINGS = (".pcd", ".ply", ".bin")
@@ -46,13 +47,17 @@ class Options(LidarOptions):
 
     poses: file of the poses, of any form, instead of the folder's own. axes: axes of the
     posed body if it is not the lidar (x forward, y left, z up): `optical`, `opengl` or `ned`. mount: where the lidar is
-    on that body: x,y,z in metres, then yaw, pitch and roll in radians. fps: clouds per second, if they have no times.
+    on that body: x,y,z in metres, then yaw, pitch and roll in radians. invert, poses_scale, max_gap: as for depth
+    images. fps: clouds per second, if they have no times.
     columns: float32 numbers a point in `.bin` files (0: found from the files, else KITTI's 4).
     """
 
     poses: str = ""
     axes: str = ""
     mount: str = ""
+    invert: bool = False
+    poses_scale: float = 1.0
+    max_gap: float = 0.0
     fps: float = 0.0
     columns: int = 0
 
@@ -62,8 +67,9 @@ class Options(LidarOptions):
             raise SourceError(f"columns={self.columns} must be 3 to {MAX_COLUMNS}: numbers a point of the .bin files")
         if self.axes and self.axes not in AXES:
             raise SourceError(f"axes={self.axes} is unknown{did_you_mean(self.axes, AXES)}")
-        if self.fps < 0:
-            raise SourceError(f"fps={self.fps:g} must be positive")
+        if self.fps < 0 or self.max_gap < 0 or not self.poses_scale > 0:
+            key = "fps" if self.fps < 0 else "max_gap" if self.max_gap < 0 else "poses_scale"
+            raise SourceError(f"{key}={getattr(self, key):g} must be positive")
 
 
 class CloudFolder(CloudSource):
@@ -100,13 +106,14 @@ class CloudFolder(CloudSource):
         if poses is None:
             raise NoPoses(f"{folder}: has no {POSE_FILES[0]}; put it there or name ?poses=FILE")
         self._poses = poses_of_images(poses, self._stamps)
-        self._T_body_lidar = np.eye(4)
-        if options.axes and options.axes != "ros":
-            self._T_body_lidar[:3, :3] = AXES[options.axes].T @ AXES["ros"]
+        self._poses.max_gap_ns = round(options.max_gap * 1e9)
         mount = mounted("mount", options.mount)
+        self._reading = CloudReading(options.axes or "ros", options.invert, options.poses_scale)
         if mount is not None:
-            self._T_body_lidar = mount @ self._T_body_lidar
+            self._reading = self._reading._replace(mount=tuple(mount.ravel().tolist()))
         self._layout = self._find_layout(options.columns)
+        found = clouds_misfit(self._points, self._raw, len(self), self._reading)
+        self.notes = (*self.notes, *filter(None, (self._poses.note, found)))
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -130,9 +137,15 @@ class CloudFolder(CloudSource):
 
     def cloud(self, i: int) -> Cloud:
         """Return cloud `i`."""
-        path, T = self._files[i], self._poses.at(self._stamps[i]) @ self._T_body_lidar
-        points = read_velodyne(path, self._layout) if path.suffix.lower() == ".bin" else _measured(path)
-        return Cloud(points, T, self._stamps[i], self.lidar, name=str(path))
+        points, T = self._points(i), self._reading.pose(self._raw(i))
+        return Cloud(points, T, self._stamps[i], self.lidar, name=str(self._files[i]))
+
+    def _points(self, i: int) -> NDArray[np.floating]:
+        path = self._files[i]
+        return read_velodyne(path, self._layout) if path.suffix.lower() == ".bin" else _measured(path)
+
+    def _raw(self, i: int) -> NDArray[np.float64]:
+        return self._poses.at(self._stamps[i])
 
     def _find_layout(self, columns: int) -> BinLayout:
         """Return the layout of `.bin` files; raises SourceError if it cannot be found."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
 import numpy as np
@@ -21,6 +21,12 @@ and the motion smooth: if the poses before and after show an acceleration that p
 by less than 1 cm and 0.01 rad."""
 
 
+OTHER_CLOCK = "its times are of another clock, so its poses are assigned in order, one for each image"
+TOO_LONG = (1000, 1_000_000, 1_000_000_000)
+HALF, MOST = 0.5, 0.8
+"""Factors by which times in other units are too long, and shares of the images that have a pose, see `in_time_of`."""
+
+
 class Poses:
     """Poses of a body (a camera, a tracker) in a world, each with a unique time; in order of time.
 
@@ -32,6 +38,7 @@ class Poses:
     faults: why poses are unusable, by stamp; one line each with the cure.
     repeated: number of poses left out because an earlier one has the same stamp.
     max_gap_ns: longest time between neighbours that is bridged, however the body moves; 0: by the two rules above.
+    note: what was assumed about their times; "" if nothing.
     Raises SourceError if there is no pose or the arrays do not fit together.
     """
 
@@ -56,12 +63,18 @@ class Poses:
         self.confidence = None if confidence is None else trust[first]
         self.where = where
         self.faults = dict(faults or {})
-        self.max_gap_ns = 0
+        self.max_gap_ns, self.note = 0, ""
         self._interval_ns = float(np.median(np.diff(self.stamps_ns))) if len(first) > 1 else 0.0
         self._stamps: list[int] = self.stamps_ns.tolist()
 
     def __len__(self) -> int:
         return len(self._stamps)
+
+    def of(self, T_world_body: ArrayLike) -> Poses:
+        """Return other poses (N, 4, 4) at the same times."""
+        found = Poses(self.stamps_ns, T_world_body, self.confidence, where=self.where, faults=self.faults)
+        found.max_gap_ns, found.note, found.repeated = self.max_gap_ns, self.note, self.repeated
+        return found
 
     def at(self, stamp_ns: int) -> Transform:
         """Return T_world_body at `stamp_ns`: a pose's own, else interpolated between its neighbours.
@@ -135,6 +148,31 @@ class Poses:
         stamp_ns = self._stamps[k]
         said = self.faults.get(stamp_ns, f"{self.where}: the pose at {seconds_from_ns(stamp_ns)} s cannot be used")
         raise FrameRefused("bad_pose_file", said)
+
+
+def in_time_of(poses: Poses, stamps_ns: Sequence[int]) -> Poses:
+    """Return poses with times in the unit of their images' times, ascending; `note` says if that was another one.
+
+    Small stamps in milli-, micro- or nanoseconds are read as seconds, and those of 100 seconds as dates. A unit is
+    changed only if it gives most images a pose, between poses of a usual rate, and fewer than half have one without.
+    """
+    covered = {factor: _covered(poses.stamps_ns // factor, stamps_ns) for factor in (1, *TOO_LONG)}
+    best = max(covered, key=lambda factor: covered[factor])
+    if covered[1] >= HALF or covered[best] < MOST:
+        return poses
+    faults = {stamp_ns // best: fault for stamp_ns, fault in poses.faults.items()}
+    found = Poses(poses.stamps_ns // best, poses.T_world_body, poses.confidence, where=poses.where, faults=faults)
+    found.note = f"{poses.where}: its times are {best:,} times those of the images, and divided by that"
+    return found
+
+
+def _covered(stamps: NDArray[np.int64], images: Sequence[int]) -> float:
+    """Return the share of the images between two poses that are less than twice `MAX_GAP_NS` apart."""
+    after = np.searchsorted(stamps, images)
+    inside = (after > 0) & (after < len(stamps))
+    exact = stamps[np.minimum(after, len(stamps) - 1)] == images
+    gaps = np.diff(stamps, prepend=stamps[0])[np.minimum(after, len(stamps) - 1)]
+    return float(np.mean(exact | (inside & (gaps < 2 * MAX_GAP_NS))))
 
 
 class UnknownPoses:

@@ -106,7 +106,10 @@ def stamped_lines(path: Path) -> list[StampedLine]:
         text = read_text(path, MAX_LIST, "replace")
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a readable file") from None
-    return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
+    lines = [(n, line) for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
+    whole = [len(word) for _, line in lines if (word := line.split()[0].lstrip("+-")).isdigit()]
+    digits = max(whole, default=0) if len(whole) == len(lines) else 0
+    return [_parse(line, f"{path}:{n}", digits) for n, line in lines]
 
 
 def inside(name: str, where: str) -> str:
@@ -139,13 +142,16 @@ def ns_from_seconds(text: str) -> int:
     return round(seconds * 1_000_000_000)
 
 
-def ns_from_stamp(text: str) -> int:
+def ns_from_stamp(text: str, longest: int = 0) -> int:
     """Return the nanoseconds of a time in seconds, or, if the number is too large for a date in seconds, in
     milliseconds, microseconds or nanoseconds: dates from 1973 to 5138 have 12 to 14, 15 to 17, and more digits.
 
-    Raises ValueError as `ns_from_seconds`.
+    longest: digits of the longest time of the file, if all are whole numbers: they have one unit. Of 11 digits they are
+    nanoseconds since the start. Raises ValueError as `ns_from_seconds`.
     """
-    digits = len(text.lstrip("+-").partition(".")[0])
+    digits = longest or len(text.lstrip("+-").partition(".")[0])
+    if longest == MILLISECOND_DIGITS - 1:
+        return int(text)
     if digits < MILLISECOND_DIGITS or not text.lstrip("+-").replace(".", "", 1).isdigit():
         return ns_from_seconds(text)
     number = Decimal(text)
@@ -159,9 +165,9 @@ def _plain(line: str) -> str:
     return line.partition("#")[0].replace(",", " ").strip()
 
 
-def _parse(line: str, where: str) -> StampedLine:
+def _parse(line: str, where: str, digits: int = 0) -> StampedLine:
     stamp, *rest = line.split(maxsplit=1)
     try:
-        return ns_from_stamp(stamp), "".join(rest), where
+        return ns_from_stamp(stamp, digits), "".join(rest), where
     except ValueError as error:
         raise SourceError(f"{where}: {error}; correct or delete the line") from None

@@ -27,7 +27,7 @@ from stereovox.sources.calibration.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.images import file_names
 from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
 from stereovox.sources.photos import nearest_in_time, photo_size, read_photo, registered
-from stereovox.sources.poses.poses import Poses
+from stereovox.sources.poses.poses import OTHER_CLOCK, Poses, in_time_of
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
@@ -295,6 +295,9 @@ class DepthFolder(DepthSource, ABC):
         """
         numbers, known = self.numbers(), image_numbers(found)
         invented = self._invented_times()
+        if isinstance(found, Poses) and not invented:
+            found = in_time_of(found, [image.stamp_ns for image in self._images])
+            self.notes += (found.note,) if found.note else ()
         shifted = len(found) == len(self) and known is not None and set(known) != set(numbers)
         poses = found if isinstance(found, ImagePoses) else in_order(found)
         if invented and known is not None and not shifted and 2 * len(set(known) & set(numbers)) >= len(self):
@@ -309,6 +312,8 @@ class DepthFolder(DepthSource, ABC):
             raise SourceError(
                 f"{found.where}: holds {len(found)} poses for {len(self)} images of {self.folder}; give one for each"
             )
+        if isinstance(found, Poses) and not invented and known is None:
+            self.notes += (f"{found.where}: {OTHER_CLOCK}",)
         return poses
 
     def _invented_times(self) -> bool:

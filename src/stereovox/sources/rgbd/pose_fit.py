@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether poses belong to their images, by how well images agree with each other at their poses.
+"""Checks whether poses belong to their images or clouds, by how well these agree with each other at their poses.
 
 Poses that are inverted, of a camera with other axes, or not in metres put each surface in another place from image to
 image. If the images agree under another reading of the same poses, that reading is right.
@@ -8,10 +8,13 @@ image. If the images agree under another reading of the same poses, that reading
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
@@ -37,6 +40,15 @@ SURELY = 0.4
 """Share of the points that must agree before no other unit is tried."""
 SAME = 0.5
 """Share of the points that stay in place in images of a static camera."""
+CLOUD_PAIRS, LATER, CLOUD_TURN, KEPT, ASKED, FEW_POINTS = 6, 10, 0.15, 20_000, 500, 100
+"""Pairs of clouds that are compared, at most how much later the second is and by how many radians it turned, and points
+of each: kept, compared, and least."""
+NEIGHBOURS, FLAT = 8, 0.1
+"""Points of a local plane, and least ratio of its second to its first variance."""
+SURE_PAIRS, CLOUDS_MOVE = 0.7, 1.2
+"""Share of the pairs that must support another reading, and by how much it must fit better than a lidar at rest."""
+OFF_LEVEL, ALL_ABOVE = 0.3, 0.9
+"""Metres by which points are above or below a lidar, and by how much more are above if it is upside down."""
 
 
 class Reading(NamedTuple):
@@ -188,3 +200,127 @@ def _standing(images: Images, unit: float, now: Reading) -> str:
         f"poses are all equal, but the images change: only {100 * found.share / found.seen:.0f} % of the points stay "
         "in place; give the poses of a moving camera"
     )
+
+
+def clouds_misfit(read: Callable[[int], NDArray[np.floating]], raw: Callable[[int], Transform], count: int,
+                  now: CloudReading) -> str:  # fmt: skip
+    """Report that poses do not fit clouds, and under which other reading they do; "" if they fit or nothing shows it.
+
+    Args:
+        read: Points (N, 3) in the lidar's frame, by number; may raise FrameRefused.
+        raw: Pose of the body (4, 4) as in the file, by number; may raise FrameRefused.
+        count: Number of clouds.
+        now: The current reading of the poses.
+    """
+    pairs, below = [], list[float]()
+    for first in np.unique(np.linspace(0, count - 2, CLOUD_PAIRS).astype(int)).tolist() if count > 1 else []:
+        with suppress(FrameRefused):
+            second = _next_turned(first, count, raw)
+            ours, theirs = (_some(read(i)) for i in (first, second))
+            if min(len(ours), len(theirs)) >= FEW_POINTS:
+                pairs.append((ours[:: max(1, len(ours) // ASKED)], cKDTree(theirs), raw(first), raw(second)))
+                heights = (ours @ now.pose(raw(first))[:3, :3].T)[:, 2]
+                below.append(float(np.mean(heights < -OFF_LEVEL) - np.mean(heights > OFF_LEVEL)))
+    if len(pairs) < MIN_PAIRS:
+        return ""
+    fits = {reading: np.array([_apart(pair, reading) for pair in pairs]) for reading in (now, *now.others())}
+    best = min(fits, key=lambda reading: float(np.median(fits[reading])))
+    still = np.array([_off_surface(ours, tree) for ours, tree, *_ in pairs])
+    usual, found = (float(np.median(fits[reading])) for reading in (now, best))
+    said = f"poses do not fit the clouds: points are {usual:.2g} m apart from cloud to cloud"
+    if CLOSER * found < usual and np.mean(CLOSER * fits[best] < fits[now]) > SURE_PAIRS:
+        moves = np.median(still) > CLOUDS_MOVE * found
+        return f"{said}; try ?{now.options(best)}, with which they are {found:.2g} m apart" if moves else (
+            f"{said}, {np.median(still):.2g} m if the lidar had not moved; check that poses belong to these clouds"
+        )  # fmt: skip
+    if CLOSER * np.median(still) < usual:
+        return f"{said}, {np.median(still):.2g} m if the lidar had not moved; check that poses belong to these clouds"
+    if below and np.median(below) < -ALL_ABOVE and not now.mounted:
+        return f"nearly all points are above the lidar; if it is upside down, try ?{now.turned}"
+    return ""
+
+
+class CloudReading(NamedTuple):
+    """Interpretation of the poses of a lidar's body.
+
+    axes, invert, poses_scale: as in `Reading`; upside_down: whether the lidar is mounted so on the body. mount: its
+    mount (16 numbers) by option. whole: whether `known` axes, `invert` and `poses_scale` can be chosen. place: of the
+    mount that is suggested.
+    """
+
+    axes: str = "ros"
+    invert: bool = False
+    poses_scale: float = 1.0
+    upside_down: bool = False
+    mount: tuple[float, ...] = tuple(np.eye(4).ravel().tolist())
+    whole: bool = True
+    known: tuple[str, ...] = tuple(AXES)
+    place: str = "0,0,0,0,0"
+
+    @property
+    def mounted(self) -> bool:
+        """Whether an option says the mount."""
+        return self.mount != CloudReading().mount
+
+    @property
+    def turned(self) -> str:
+        """The option for a lidar that is upside down."""
+        return f"mount={self.place},3.14159265"
+
+    def pose(self, T: Transform) -> Transform:
+        """Return T_world_lidar (4, 4) in metres of a pose (4, 4) as in the file."""
+        T = inverse(T) if self.invert else T.copy()
+        T[:3, 3] *= self.poses_scale
+        turn = np.eye(4)
+        turn[:3, :3] = AXES[self.axes].T @ AXES["ros"] @ np.diag([1, *([-1, -1] if self.upside_down else [1, 1])])
+        return T @ np.reshape(self.mount, (4, 4)) @ turn
+
+    def others(self) -> list[CloudReading]:
+        """Return the readings that options can give."""
+        if not self.whole:
+            return [] if self.mounted else [self._replace(upside_down=True)]
+        turns = (False,) if self.mounted else (False, True)
+        found = [self._replace(axes=a, invert=i, poses_scale=s, upside_down=u)
+                 for a, i, s, u in product(self.known, (False, True), POSE_SCALES, turns)]  # fmt: skip
+        return [one for one in found if one != self and not (one.upside_down and one.axes != "ros")]
+
+    def options(self, other: CloudReading) -> str:
+        """Return the options that change this reading into another."""
+        changes = {"invert": "01"[other.invert], "axes": other.axes, "poses_scale": f"{other.poses_scale:g}"}
+        words = [f"{key}={text}" for key, text in changes.items() if getattr(self, key) != getattr(other, key)]
+        return "&".join([*words, self.turned] if other.upside_down else words)
+
+
+def _next_turned(first: int, count: int, raw: Callable[[int], Transform]) -> int:
+    """Return the number of the next cloud by which the body turned enough, at most ten later."""
+    last = min(count - 1, first + LATER)
+    start = raw(first)[:3, :3]
+    turned = (i for i in range(first + 1, last) if np.trace(start.T @ raw(i)[:3, :3]) < 1 + 2 * np.cos(CLOUD_TURN))
+    return next(turned, last)
+
+
+def _some(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    points = np.asarray(points, float)
+    points = points[np.isfinite(points).all(axis=1)]
+    return points[:: max(1, len(points) // KEPT)]
+
+
+def _apart(pair: tuple[NDArray[np.float64], cKDTree, Transform, Transform], reading: CloudReading) -> float:
+    """Return the median distance in metres of one cloud's points from the other's surface."""
+    points, tree, first, second = pair
+    T = inverse(reading.pose(second)) @ reading.pose(first)
+    return _off_surface(points @ T[:3, :3].T + T[:3, 3], tree)
+
+
+def _off_surface(points: NDArray[np.float64], tree: cKDTree) -> float:
+    """Return the median distance of points from planes through the nearest points, or from the nearest, if these lie on
+    a line or are further away than from each other.
+    """
+    near, which = tree.query(points, NEIGHBOURS)
+    around = tree.data[which]
+    middle = around.mean(axis=1)
+    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around - middle[:, None], around - middle[:, None]))
+    off = np.abs(np.einsum("ni,ni->n", points - middle, axes[:, :, 0]))
+    spread = np.sqrt(values[:, 2] / NEIGHBOURS)
+    plane = (values[:, 1] > FLAT * values[:, 2]) & (near[:, 0] < 2 * spread)
+    return float(np.median(np.where(plane, off, near[:, 0])))

@@ -13,10 +13,10 @@ import numpy as np
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources import parameters
-from stereovox.sources.poses.poses import Poses, seconds_from_ns
+from stereovox.sources.poses.poses import OTHER_CLOCK, Poses, in_time_of, seconds_from_ns
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.rgbd.folder import folder_part
-from stereovox.sources.rgbd.pose_files import ImagePoses, in_optical_axes, read_poses
+from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_optical_axes, read_poses
 
 POSES: Mapping[str, Any] = {"poses": "", "axes": "", "invert": False}
 """Options of all stereo recordings: a file or folder of poses instead of the layout's own (see `rgbd.pose_files`);
@@ -49,6 +49,7 @@ def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
     """
     found, stamps = read_poses(path), sorted(set(stamps_ns))
     if isinstance(found, Poses):
+        found = in_time_of(found, stamps)
         if found.stamps_ns[0] <= stamps[-1] and stamps[0] <= found.stamps_ns[-1]:
             return found
         if len(found) != len(stamps):
@@ -58,7 +59,10 @@ def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
             )
             said = f"poses from {theirs}, images from {ours}: no time in common"
             raise SourceError(f"{path}: {said}; give poses of this recording")
-        return Poses(stamps, found.T_world_body, where=str(path))
+        assigned = Poses(stamps, found.T_world_body, where=str(path))
+        if image_numbers(found) is None:
+            assigned.note = f"{path}: {OTHER_CLOCK}"
+        return assigned
     if len(found) != len(stamps):
         raise SourceError(f"{path}: holds {len(found)} poses for {len(stamps)} images; give one for each")
     return _over_time(found, stamps)
@@ -71,7 +75,7 @@ def as_body(poses: Poses, T_body_left: Transform, axes: str, inverted: bool) -> 
         return poses
     T_left_body = inverse(T_body_left) if axes else np.eye(4)
     T = [in_optical_axes(T, axes or "optical", inverted) @ T_left_body for T in poses.T_world_body]
-    return Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults)
+    return poses.of(T)
 
 
 def _over_time(poses: ImagePoses, stamps: Sequence[int]) -> Poses:

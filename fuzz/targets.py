@@ -38,16 +38,16 @@ from stereovox.evaluate.trajectory import read_relations
 from stereovox.files.safe_io import SEAL, _digest, sealed, unsealed
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map
+from stereovox.formats.cell_size import raised
 from stereovox.formats.clouds import read_cloud_map
-from stereovox.formats.grid_to_voxels import raised
 from stereovox.formats.map_server import read_map_server, write_map_server
-from stereovox.formats.read_points import read_npz
+from stereovox.formats.points import read_npz
 from stereovox.formats.scan_graph import read_scan_graph
 from stereovox.maps import VoxelMap, load_map, save_boxed
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_source
-from stereovox.sources import images
+from stereovox.sources import photos
 from stereovox.sources.calibration.calibration_files import import_rig
 from stereovox.sources.calibration.camera_file import find_camera, read_camera
 from stereovox.sources.kitti.calibration import read_calibration, read_raw_calibration
@@ -741,7 +741,7 @@ TARGETS: dict[str, Target] = {
     "pose_file": Target(pose_texts, read_pose_text),
     "sens": Target(sens_files, partial(read_packed, "a.sens")),
     "slambench_raw": Target(raw_frames, partial(read_packed, "a.raw")),
-    "picture_png": Target(grey_pngs, partial(read_png, images.read_picture_png)),
+    "picture_png": Target(grey_pngs, partial(read_png, photos.read_picture_png)),
     "map_manifest": Target(manifests, read_manifest),
     "map_arrays": Target(pieces, read_piece),
     "map_cells": Target(some_coords, read_cells),

@@ -5,7 +5,7 @@ import pytest
 
 from stereovox import load_map
 from stereovox.cli import main
-from stereovox.descriptions.description import map_name, picture_name
+from stereovox.descriptions.files import map_name, picture_name
 
 COARSE = ("sim:room?image_width=160", "--voxel-size", "0.4", "--frames", ":2")
 

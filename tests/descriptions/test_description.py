@@ -9,7 +9,7 @@ from made_depth import camera_text, matrix_line, posed, render, units, write
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.descriptions.description import many, metres
+from stereovox.descriptions.files import many, metres
 from stereovox.runs.survey import UpEstimate
 
 

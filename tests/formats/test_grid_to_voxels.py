@@ -7,7 +7,7 @@ import pytest
 from stereovox.cli import main
 from stereovox.errors import StereovoxError
 from stereovox.formats import import_map
-from stereovox.formats.grid_to_voxels import raised
+from stereovox.formats.cell_size import raised
 from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid

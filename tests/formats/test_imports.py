@@ -226,7 +226,7 @@ def test_damaged_npz(tmp_path, voxel_map):
 @pytest.mark.parametrize("ending", [".npz", ".ply", ".pcd"])
 def test_cells_in_too_many_blocks_are_refused(tmp_path, voxel_map, ending, monkeypatch):
     export(voxel_map, tmp_path / f"map{ending}")
-    monkeypatch.setattr("stereovox.formats.read_points.MAX_BLOCKS", 1)
+    monkeypatch.setattr("stereovox.formats.points.MAX_BLOCKS", 1)
     with pytest.raises(MapFileError, match=r"blocks, more than 1;"):
         import_map(tmp_path / f"map{ending}")
 

@@ -14,7 +14,7 @@ from stereovox.geometry.se3 import rotation_matrix
 from stereovox.opening import open_images
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.calibration.camera_file import with_camera
-from stereovox.sources.turned import Turned, TurnedRecording
+from stereovox.sources.paced import Turned, TurnedRecording
 
 COUNT = 20
 ASLANT = np.eye(4)

@@ -22,12 +22,11 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.evaluate.inputs import read_camera_path
 from stereovox.evaluate.trajectory import read_relations
 from stereovox.opening import open_source
-from stereovox.sources.bags import unpack
-from stereovox.sources.bags.db3 import Db3File
+from stereovox.sources.bags import files
+from stereovox.sources.bags.files import ALWAYS_ALLOWED, Db3File, decompress, max_unpacked
 from stereovox.sources.bags.messages import Wire, ns_from_ms, read_camera_info
 from stereovox.sources.bags.robot_messages import read_laser_scan, read_point_cloud
-from stereovox.sources.bags.unpack import ALWAYS_ALLOWED, decompress, max_unpacked
-from stereovox.sources.images import SIGNATURE, read_picture_png
+from stereovox.sources.photos import SIGNATURE, read_picture_png
 from stereovox.sources.rgbd.depth_files import read_depth
 from stereovox.sources.robots import carmen
 from stereovox.sources.robots.carmen import CarmenLog
@@ -38,8 +37,8 @@ PACK = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
 
 @pytest.mark.parametrize("packing", PACK)
 def test_a_small_piece_that_swells_is_refused_early(packing, monkeypatch):
-    monkeypatch.setattr(unpack, "ALWAYS_ALLOWED", 1 << 20)
-    monkeypatch.setattr(unpack, "MAX_RATIO", 20)
+    monkeypatch.setattr(files, "ALWAYS_ALLOWED", 1 << 20)
+    monkeypatch.setattr(files, "MAX_RATIO", 20)
     bomb = PACK[packing](bytes(60 << 20))
     assert max_unpacked(len(bomb)) < 20 << 20
     tracemalloc.start()
@@ -57,7 +56,7 @@ def test_what_may_swell_how_far():
 
 def test_many_chunks_that_swell_a_little(tmp_path, monkeypatch):
     """Each alone is small enough; without an index the whole file is gone through."""
-    monkeypatch.setattr(unpack, "ALWAYS_ALLOWED", 1 << 20)
+    monkeypatch.setattr(files, "ALWAYS_ALLOWED", 1 << 20)
     inner = record(200, bytes((1 << 20) - 9))
     bomb = chunk_record(inner, 0, 1, Style("zstd"))
     (tmp_path / "a.mcap").write_bytes(MAGIC + record(1, text("") + text("")) + bomb * 30)

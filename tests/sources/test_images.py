@@ -9,7 +9,7 @@ import pytest
 from made_recordings import SIZE, depth_image, png_bytes, write_png
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.images import PICTURE_KINDS, common_size, png_size, read_picture_png
+from stereovox.sources.photos import PICTURE_KINDS, common_size, png_size, read_picture_png
 from stereovox.sources.rgbd.depth_files import read_depth
 
 

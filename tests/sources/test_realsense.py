@@ -136,7 +136,7 @@ def test_a_colour_camera_whose_place_is_unknown_is_told_of_and_left_out(camera, 
     def unknown(one, other):
         raise RuntimeError("Requested extrinsics are not available!")
 
-    monkeypatch.setattr("stereovox.sources.realsense.realsense_photo.transform_between", unknown)
+    monkeypatch.setattr("stereovox.sources.realsense.realsense_sensor.transform_between", unknown)
     stream = open_stream("realsense:")
     assert stream.notes == ("realsense:042: its colour camera is not used (Requested extrinsics are not available!)",)
     with camera.sending():

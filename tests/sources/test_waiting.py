@@ -3,7 +3,7 @@
 
 import pytest
 
-from stereovox.sources.waiting import Arrival, Waiting
+from stereovox.sources.latest import Arrival, Waiting
 
 MS = 1_000_000
 

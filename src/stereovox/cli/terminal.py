@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.descriptions.description import command_line as command_line
-from stereovox.descriptions.description import size as size
-from stereovox.descriptions.description import thousands as thousands
+from stereovox.descriptions.files import command_line as command_line
+from stereovox.descriptions.files import size as size
+from stereovox.descriptions.files import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-from stereovox.descriptions.description import Description as Description
+from stereovox.descriptions.files import Description as Description
 from stereovox.errors import SourceError, shortened
 from stereovox.sources.foreign_files import POINTS, is_pointer
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import Config, load_config, profile_names
-from stereovox.descriptions.description import Description, command_line, picture_name, size, thousands
+from stereovox.descriptions.files import Description, command_line, picture_name, size, thousands
 from stereovox.errors import MapFileError
 from stereovox.files.safe_io import FLOOR_READABLE, read_part
 from stereovox.formats.map_server import read_map_server

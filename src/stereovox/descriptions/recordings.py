@@ -9,15 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.descriptions.description import (
-    Description,
-    command_line,
-    many,
-    map_name,
-    metres,
-    picture_name,
-    thousands,
-)
+from stereovox.descriptions.files import Description, command_line, many, map_name, metres, picture_name, thousands
 from stereovox.errors import NoPoses, StereovoxError, without_name
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.runs.survey import LEVEL_ENOUGH, TILTED, Survey, UpEstimate, survey

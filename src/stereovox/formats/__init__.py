@@ -26,10 +26,10 @@ FLOORS = (".yaml", ".yml", ".pgm", ".png", ".bmp")
 IMPORTS = {
     ".bt": "stereovox.formats.octomap:read_octomap",
     ".ot": "stereovox.formats.octomap:read_octomap",
-    ".npz": "stereovox.formats.read_points:read_npz",
+    ".npz": "stereovox.formats.points:read_npz",
     ".graph": "stereovox.formats.scan_graph:read_scan_graph",
     **dict.fromkeys(CLOUDS, "stereovox.formats.clouds:read_cloud_map"),
-    **dict.fromkeys(FLOORS, "stereovox.formats.grid_to_voxels:read_raised_floor"),
+    **dict.fromkeys(FLOORS, "stereovox.formats.cell_size:read_raised_floor"),
     ".bag": "stereovox.formats.bags:read_bag_map",
     ".mcap": "stereovox.formats.bags:read_bag_map",
     ".db3": "stereovox.formats.bags:read_bag_map",

@@ -19,7 +19,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.files.safe_io import read_bounded
 from stereovox.formats.cell_size import SuggestedCell, extents, suggested_cell, suggested_for_mesh
 from stereovox.formats.las import read_las
-from stereovox.formats.read_points import cells_of_points
+from stereovox.formats.points import cells_of_points
 from stereovox.formats.text_points import read_text_points
 from stereovox.maps import VoxelMap
 from stereovox.maps.record.history import Imported

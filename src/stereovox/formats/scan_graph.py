@@ -21,7 +21,7 @@ from stereovox.depth.cloud import checked_cloud
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.files.safe_io import read_bounded, shown
 from stereovox.formats.cell_size import suggested_cell
-from stereovox.formats.read_points import MAX_BLOCKS
+from stereovox.formats.points import MAX_BLOCKS
 from stereovox.frame import Cloud
 from stereovox.geometry.se3 import Transform, from_quaternion, transform_points
 from stereovox.integrate.points import scan_evidence

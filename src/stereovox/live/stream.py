@@ -29,12 +29,11 @@ from stereovox.runs.survey import level_pose
 from stereovox.runs.warm_up import GIVEN, HOW, TRACK, has_poses
 from stereovox.sources.base import Stream, closing, stream_of
 from stereovox.sources.imu import Imu
-from stereovox.sources.latest import STOPPING_S, Latest
+from stereovox.sources.latest import STOPPING_S, Arrival, Latest, Waiting
 from stereovox.sources.paced import Paced
 from stereovox.sources.poses.clock_watch import Delays, Heard
 from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.pose_stream import T_OPTICAL_BODY, PoseStream
-from stereovox.sources.waiting import Arrival, Waiting
 from stereovox.track.stream import follow
 from stereovox.track.tracker import POSE_FAULTS, Tracked, Tracker
 

@@ -20,15 +20,23 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Cloud, Frame, Range, Rays, Scan
 from stereovox.geometry.se3 import inverse
 from stereovox.ros.poses.poses import Pose, PoseBuffer
-from stereovox.sources.bags.compressed_depth import SUFFIXES, plain_topic
-from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, check_frame, decoded, sibling
+from stereovox.sources.bags.depth_topic import (
+    RECTIFIED,
+    SUFFIXES,
+    UNITS,
+    camera_of,
+    check_frame,
+    decoded,
+    plain_topic,
+    sibling,
+)
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
 from stereovox.sources.bags.robot_messages import frame_name, read_laser_scan, read_point_cloud, read_range
 from stereovox.sources.clouds.bag import cloud_of_scan, range_of_reading
 from stereovox.sources.clouds.options import LidarOptions
 from stereovox.sources.poses.poses import seconds_from_ns
 from stereovox.sources.robots.bag import posed_scan
-from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
+from stereovox.sources.robots.frames import CloudBand, scan_of_cloud
 
 LONGEST_SWEEP_S = 0.5
 """Most seconds of a lidar's sweep; clouds whose points have later times do not wait for the poses of these."""

@@ -30,8 +30,8 @@ from stereovox.ros.poses.pose_source import pose_source
 from stereovox.ros.poses.poses import Pose, SensorPoses, fixed_transform
 from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses
 from stereovox.ros.subscriptions import Silence, Subscriptions
+from stereovox.sources.latest import Arrival, Waiting
 from stereovox.sources.poses.clock_watch import Heard
-from stereovox.sources.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when idle, and while frames are waiting."""

@@ -45,7 +45,7 @@ from stereovox.runs.engine import (
 from stereovox.runs.survey import LEVELLED, TILTED, level_start, survey
 from stereovox.runs.warm_up import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.sources.calibration.camera_file import with_camera
-from stereovox.sources.turned import Turned
+from stereovox.sources.paced import Turned
 from stereovox.track.inertial import imu_and_note
 from stereovox.track.stream import AnyTracker, GuidedTracker, LostSpans, TrackedStream, TrackingGap
 from stereovox.track.tracker import Tracker

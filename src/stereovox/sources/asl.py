@@ -19,9 +19,9 @@ from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.calibration_files import read_calibration
 from stereovox.sources.calibration.calibration_values import StereoCalibration, read_yaml, rigid
-from stereovox.sources.images import file_names
 from stereovox.sources.imu import ImuReadings, checked_imu, in_order
 from stereovox.sources.parameters import file_of
+from stereovox.sources.photos import file_names
 from stereovox.sources.poses.poses import Poses, UnknownPoses, seconds_from_ns
 from stereovox.sources.poses.trajectory import Trajectory, inside, transforms
 from stereovox.sources.rgbd.folder import folder_part

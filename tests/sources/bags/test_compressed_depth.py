@@ -10,7 +10,7 @@ from made_bags import Bag, camera_info, depth, header, message, stamp
 
 from stereovox.errors import SourceError
 from stereovox.sources.bags.recording import Bag as BagSource
-from stereovox.sources.images import decode_rvl
+from stereovox.sources.photos import decode_rvl
 
 TOPIC, INFO = "/camera/depth/image_raw", "/camera/depth/camera_info"
 IMAGES = {

@@ -19,7 +19,7 @@ from stereovox.errors import SourceError
 from stereovox.frame import Frame
 from stereovox.opening import open_source
 from stereovox.sources.bags import FOLDER, open_bag, suffix_of
-from stereovox.sources.bags.folder import FolderFile
+from stereovox.sources.bags.files import FolderFile
 from stereovox.sources.bags.writer import BagWriter
 
 CAMERA = PinholeCamera(8, 6, 10.0, 10.5, 3.4, 2.6)

@@ -10,7 +10,7 @@ import pytest
 
 from stereovox.geometry.se3 import from_quaternion, inverse, transform_points
 from stereovox.sources.bags.robot_messages import PointCloud
-from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
+from stereovox.sources.robots.frames import CloudBand, scan_of_cloud
 
 BAND = CloudBand(0.1, 1.0, 0.3, 5.0, math.radians(3))
 

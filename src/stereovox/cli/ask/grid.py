@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.map.localize import add_start
 from stereovox.cli.options import add_checkpoint, add_usual, options_of
-from stereovox.cli.robot_options import add_robot, picture_line, settings_of
+from stereovox.cli.recordings import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
     but_few,
     cells_line,

@@ -72,7 +72,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _usual_file(path: str) -> str:
     """Return the default name of the picture; raises StereovoxError if that would replace a file."""
-    from stereovox.descriptions.description import command_line, picture_name
+    from stereovox.descriptions.files import command_line, picture_name
 
     name = picture_name(path)
     if Path(name).exists():

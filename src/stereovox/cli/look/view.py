@@ -102,7 +102,7 @@ def _recording(arguments: Namespace, config: Config) -> Source | None:
         return None
     from stereovox.opening import open_source
     from stereovox.products.moved import level_transform
-    from stereovox.sources.turned import TurnedRecording
+    from stereovox.sources.paced import TurnedRecording
 
     source = open_source(arguments.recording, arguments.frames)
     if config.levelled_from is None:

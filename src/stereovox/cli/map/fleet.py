@@ -21,7 +21,7 @@ from stereovox.cli.terminal import (
     say_about_compiling,
     size,
 )
-from stereovox.descriptions.description import many
+from stereovox.descriptions.files import many
 
 if TYPE_CHECKING:
     from stereovox.fleet import FleetMap, FleetPlan

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stereovox.cli.maps import open_grid
-from stereovox.cli.robot_options import add_robot, open_noting, print_trajectory_error, settings_of
+from stereovox.cli.recordings import add_robot, open_noting, print_trajectory_error, settings_of
 from stereovox.cli.terminal import but_few, progress_of_steps, say, say_about_compiling
 from stereovox.files.safe_io import check_file
 

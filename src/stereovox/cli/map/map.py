@@ -104,7 +104,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _usual_out(arguments: Namespace, ending: str) -> str:
     """Return the default name of the map; raises StereovoxError if that would replace something."""
-    from stereovox.descriptions.description import map_name
+    from stereovox.descriptions.files import map_name
 
     out = map_name(arguments.source, ending)
     if Path(out).exists() and not arguments.resume:
@@ -130,7 +130,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
 def _is_floor_map(arguments: Namespace) -> bool:
     """Return whether the settings are for the 2-D map of a ground robot, as in profile ist2019."""
-    from stereovox.cli.robot_options import settings_of
+    from stereovox.cli.recordings import settings_of
 
     return settings_of(arguments).dimensions == 2
 
@@ -146,7 +146,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
 
 
 def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path, config: Config) -> None:
-    from stereovox.descriptions.description import picture_name
+    from stereovox.descriptions.files import picture_name
     from stereovox.maps.record.health import FULL
 
     say_refusals(result, mapped.reports, "frames")

@@ -12,7 +12,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robot_options import add_robot, open_noting, picture_line, print_trajectory_error, settings_of
+from stereovox.cli.recordings import add_robot, open_noting, picture_line, print_trajectory_error, settings_of
 from stereovox.cli.terminal import but_few, progress_of_steps, say, say_about_compiling
 from stereovox.files.safe_io import FLOOR_ENDINGS, check_file
 

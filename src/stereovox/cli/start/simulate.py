@@ -9,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.robot_options import open_noting
+from stereovox.cli.recordings import open_noting
 from stereovox.cli.terminal import command_line, progress_bar, say, size
 from stereovox.files.safe_io import check_file
 

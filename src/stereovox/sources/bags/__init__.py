@@ -22,7 +22,7 @@ def suffix_of(path: str) -> str:
     """
     try:
         if os.path.isdir(path):
-            from stereovox.sources.bags.folder import is_bag_folder
+            from stereovox.sources.bags.files import is_bag_folder
 
             return FOLDER if is_bag_folder(path) else ""
         if not os.path.isfile(path):  # opening a named pipe would block
@@ -38,7 +38,7 @@ def suffix_of(path: str) -> str:
 def open_bag(path: Path) -> BagFile:
     """Open a `.bag`, `.db3`, `.mcap` or rosbag2 folder; raises SourceError for anything else or damage."""
     if path.is_dir():
-        from stereovox.sources.bags.folder import FolderFile
+        from stereovox.sources.bags.files import FolderFile
 
         return FolderFile(path, open_bag)
     try:
@@ -61,6 +61,6 @@ def open_bag(path: Path) -> BagFile:
         from stereovox.sources.bags.mcap import McapFile
 
         return McapFile(path)
-    from stereovox.sources.bags.db3 import Db3File
+    from stereovox.sources.bags.files import Db3File
 
     return Db3File(path)

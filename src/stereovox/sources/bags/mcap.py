@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
-from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
+from stereovox.sources.bags.files import MAX_BYTES, BagFile, decompress, decompress_message, max_unpacked, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import decompress, decompress_message, max_unpacked
 
 START = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 7, 8, 11

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Photo
 from stereovox.geometry.se3 import Transform
-from stereovox.sources.bags.compressed_depth import holds_depth
 from stereovox.sources.bags.depth_topic import (
     CAMERA_INFO,
     COMPRESSED,
@@ -22,6 +21,7 @@ from stereovox.sources.bags.depth_topic import (
     DepthTopic,
     camera_of,
     first_picture,
+    holds_depth,
     read_picture,
     sibling,
 )
@@ -29,7 +29,7 @@ from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import Picture, read_camera_info
 from stereovox.sources.bags.tf import Tf
 from stereovox.sources.photos import decode_photo
-from stereovox.sources.rgbd.undistort import Undistortion
+from stereovox.sources.rgbd.depth_files import Undistortion
 
 CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "mono8": 1, "8UC1": 1}
 """Encodings of pictures, and their channels; the order of colours does not matter for grey corners."""

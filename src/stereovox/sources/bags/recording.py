@@ -27,6 +27,7 @@ from stereovox.sources.base import DepthSource
 from stereovox.sources.imu import ImuReadings
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES, WORLDS, turned
+from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 from stereovox.sources.rigs.rig_options import poses_of_images
 
@@ -135,12 +136,14 @@ class Bag(DepthSource):
             return ()
         poses, name = self._poses, str(self._file.path)
 
-        def read(i: int) -> NDArray[np.generic]:
-            return self._depth.image(i, name)[0]
+        @lru_cache(12)
+        def read(i: int) -> Depth:
+            image, _, _ = self._depth.image(i, name)
+            return image  # pyrefly: ignore[bad-return] - uint16 or float32
 
         try:
             unit = self._scale or self._depth.image(0, name)[2]
-            images = Images(len(self), lambda i: poses.at(self._depth.time_ns(i)), lru_cache(12)(read), self.camera)
+            images = Images(len(self), lambda i: poses.at(self._depth.time_ns(i)), read, self.camera)
             found = misfit(images, unit, unit, Reading())
         except FrameRefused:  # reported when it is read
             return ()

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
-from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
+from stereovox.sources.bags.files import MAX_BYTES, BagFile, decompress, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import decompress
 
 CHUNKS = 4
 """Decompressed chunks kept: enough for an image, its metadata and the poses around it."""

@@ -39,8 +39,8 @@ class Options(LidarOptions):
     separated by commas. silence_clears: 1 if a cone in which nothing was heard is free (`RangeSensor`). poses: topic or
     file of the lidar's poses, or of its body's; default: /tf.
     mount: where the lidar is on the posed body, instead of /tf: x,y,z in metres, then yaw, pitch and roll in radians
-    (0,0,0: the poses are the lidar's). world_frame, invert, poses_scale, max_gap: as for depth images. deskew: 0 to treat the points of a cloud as
-    measured at once although they have times.
+    (0,0,0: the poses are the lidar's). world_frame, invert, poses_scale, max_gap: as for depth images. deskew: 0 to
+    treat the points of a cloud as measured at once although they have times.
     """
 
     cloud: str = ""
@@ -113,6 +113,8 @@ class BagClouds(CloudSource):
 
         def points(i: int) -> np.ndarray:
             message = self._scans.read(i)
+            if isinstance(message, RangeReading):
+                return np.empty((0, 3))
             return message.points if isinstance(message, PointCloud) else cloud_of_scan(message).points
 
         return clouds_misfit(points, raw, len(self), now)

@@ -17,9 +17,9 @@ from stereovox.frame import Cloud
 from stereovox.frame.validate import MAX_INT
 from stereovox.sources.base import Part
 from stereovox.sources.clouds.options import CloudSource, LidarOptions, no_others, options_of
-from stereovox.sources.images import file_names
 from stereovox.sources.lidar import BinLayout, find_layout, read_velodyne
 from stereovox.sources.parameters import file_of, mounted
+from stereovox.sources.photos import file_names
 from stereovox.sources.point_files import read_points
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds

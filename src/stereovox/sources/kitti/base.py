@@ -18,9 +18,9 @@ from stereovox.files.safe_io import MAX_LIST, read_text
 from stereovox.frame import StereoFrame, Viewpoint
 from stereovox.geometry.se3 import Transform, inverse
 from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE_KINDS, common_size, file_names, read_picture_png
 from stereovox.sources.kitti.calibration import KittiCalibration
 from stereovox.sources.lidar import Box, LidarScan, read_velodyne
+from stereovox.sources.photos import PICTURE_KINDS, common_size, file_names, read_picture_png
 
 PAIRS = {"grey": (0, 1), "colour": (2, 3)}
 """Camera numbers of the left and right eye."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.images import PICTURE_KINDS, png_size, read_picture_png
 from stereovox.sources.kitti.base import KittiSource, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, from_raw_files, read_calibration
 from stereovox.sources.kitti.poses import StandingPoses
+from stereovox.sources.photos import PICTURE_KINDS, png_size, read_picture_png
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rigs.rig_options import folder_and_options
 

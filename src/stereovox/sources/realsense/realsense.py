@@ -17,9 +17,14 @@ from stereovox.frame import Frame
 from stereovox.sources import parameters
 from stereovox.sources.base import Stream
 from stereovox.sources.imu import LiveImu
-from stereovox.sources.realsense.realsense_imu import FIRST_IMAGES, FIRST_S, find_motion
-from stereovox.sources.realsense.realsense_photo import find_photos
-from stereovox.sources.realsense.realsense_sensor import ns_from_ms, stopped
+from stereovox.sources.realsense.realsense_sensor import (
+    FIRST_IMAGES,
+    FIRST_S,
+    find_motion,
+    find_photos,
+    ns_from_ms,
+    stopped,
+)
 
 T = TypeVar("T")
 

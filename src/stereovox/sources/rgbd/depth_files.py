@@ -2,6 +2,9 @@
 """Depth images of the usual kinds of files, recognised by content: PNG, PGM, TIFF, PFM, OpenEXR, NumPy.
 
 A PNG's checksums are verified before it is decoded (see `images`); the other kinds have none.
+
+Confidence images next to depth images, as in ARKit: 0 low, 1 medium, 2 high. Conversion of depth images of a distorting
+lens into those of a pinhole camera.
 """
 
 from __future__ import annotations
@@ -14,16 +17,16 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.pinhole import MAX_PIXELS
+from stereovox.cameras.pinhole import MAX_PIXELS, PinholeCamera
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.files.safe_io import read_bounded
 from stereovox.sources.foreign_files import POINTER, POINTS
-from stereovox.sources.images import GREY_16, MAX_BYTES, SIGNATURE, decode_png, size_text, spread
+from stereovox.sources.photos import GREY_16, MAX_BYTES, SIGNATURE, decode_png, size_text, spread
 
 SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
 """Suffixes of depth images, in lower case."""
@@ -312,3 +315,75 @@ DECODERS: dict[bytes, Callable[[Path, bytes], NDArray[np.generic]]] = {
     b"PK\x03\x04": _numpy,
 }
 """By the first bytes of a file; PNG is handled separately."""
+
+
+KINDS = frozenset({(8, 0)})
+
+
+def without_low(depth: Depth, path: Path, lowest: int) -> Depth:
+    """Return a depth image with 0 where its confidence is less than `lowest`.
+
+    Args:
+        depth: (height, width) in any unit.
+            path: 8-bit grey PNG of the same size, values growing with the confidence; without it all is kept.
+            lowest: Smallest confidence that is kept.
+
+        Returns:
+            (height, width), of the same type; 0 is invalid.
+
+    Raises:
+        FrameRefused: `unreadable`, `bad_dtype` or `bad_shape` of the confidence image.
+    """
+    try:
+        content = read_bounded(path, MAX_BYTES)
+    except FileNotFoundError:
+        return depth
+    except OSError as error:
+        raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
+    size = depth.shape[1], depth.shape[0]
+    confidence = decode_png(path, content, size, KINDS, "confidence must be an 8-bit grey PNG")
+    return np.where(confidence.astype(np.uint8) < lowest, depth.dtype.type(0), depth)
+
+
+Image = TypeVar("Image", bound=NDArray[Any])
+
+NEGLIGIBLE_PX = 0.5
+"""Distortion of at most this is ignored."""
+
+
+class Undistortion:
+    """Moves the pixels of depth images to their positions in a pinhole camera with the same intrinsics.
+
+    Each pixel takes the value of the nearest pixel of the distorted image, since depth must not be averaged across
+    edges.
+
+    Args:
+        camera: The pinhole camera.
+        coefficients: k1, k2, p1, p2, k3 and so on, in OpenCV's order.
+
+    Attributes:
+        moved_px: Largest displacement of a pixel; 0 if it is negligible, and then nothing is changed.
+    """
+
+    def __init__(self, camera: PinholeCamera, coefficients: Sequence[float]):
+        self._maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+        self.moved_px = 0.0
+        if not any(coefficients):
+            return
+        import cv2
+
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        size = camera.width, camera.height
+        columns, rows = cv2.initUndistortRectifyMap(K, np.array(coefficients), np.eye(3), K, size, cv2.CV_32FC1)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        moved = float(np.hypot(columns - u, rows - v).max())
+        if not moved <= NEGLIGIBLE_PX:
+            self._maps, self.moved_px = (columns, rows), moved
+
+    def __call__(self, image: Image) -> Image:
+        """Return the undistorted image (height, width), 0 outside the distorted one."""
+        if self._maps is None:
+            return image
+        import cv2
+
+        return cast("Image", cv2.remap(image, *self._maps, cv2.INTER_NEAREST, borderValue=0))

@@ -24,9 +24,8 @@ from stereovox.sources import parameters
 from stereovox.sources.base import DepthSource
 from stereovox.sources.calibration.camera_file import FoundCamera, Standard, camera_in, find_camera
 from stereovox.sources.calibration.intrinsics import NAMES, metres_per_unit
-from stereovox.sources.images import file_names
 from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
-from stereovox.sources.photos import nearest_in_time, photo_size, read_photo, registered
+from stereovox.sources.photos import file_names, nearest_in_time, photo_size, read_photo, registered
 from stereovox.sources.poses.poses import OTHER_CLOCK, Poses, in_time_of
 from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.poses.trajectory import ns_from_seconds

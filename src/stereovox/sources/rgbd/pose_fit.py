@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
@@ -218,7 +218,7 @@ def clouds_misfit(read: Callable[[int], NDArray[np.floating]], raw: Callable[[in
             second = _next_turned(first, count, raw)
             ours, theirs = (_some(read(i)) for i in (first, second))
             if min(len(ours), len(theirs)) >= FEW_POINTS:
-                pairs.append((ours[:: max(1, len(ours) // ASKED)], cKDTree(theirs), raw(first), raw(second)))
+                pairs.append((ours[:: max(1, len(ours) // ASKED)], KDTree(theirs), raw(first), raw(second)))
                 heights = (ours @ now.pose(raw(first))[:3, :3].T)[:, 2]
                 below.append(float(np.mean(heights < -OFF_LEVEL) - np.mean(heights > OFF_LEVEL)))
     if len(pairs) < MIN_PAIRS:
@@ -305,14 +305,14 @@ def _some(points: NDArray[np.floating]) -> NDArray[np.float64]:
     return points[:: max(1, len(points) // KEPT)]
 
 
-def _apart(pair: tuple[NDArray[np.float64], cKDTree, Transform, Transform], reading: CloudReading) -> float:
+def _apart(pair: tuple[NDArray[np.float64], KDTree, Transform, Transform], reading: CloudReading) -> float:
     """Return the median distance in metres of one cloud's points from the other's surface."""
     points, tree, first, second = pair
     T = inverse(reading.pose(second)) @ reading.pose(first)
     return _off_surface(points @ T[:3, :3].T + T[:3, 3], tree)
 
 
-def _off_surface(points: NDArray[np.float64], tree: cKDTree) -> float:
+def _off_surface(points: NDArray[np.float64], tree: KDTree) -> float:
     """Return the median distance of points from planes through the nearest points, or from the nearest, if these lie on
     a line or are further away than from each other.
     """

@@ -18,8 +18,8 @@ from stereovox.errors import FrameRefused, NoPoses, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.geometry.se3 import Transform
 from stereovox.sources.base import Part, Source
-from stereovox.sources.images import EYE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.parameters import file_of
+from stereovox.sources.photos import EYE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.poses.poses import Poses, UnknownPoses
 from stereovox.sources.poses.trajectory import Trajectory, by_time, inside, stamped_lines
 from stereovox.sources.rgbd.folder import SECOND, folder_part

@@ -18,7 +18,7 @@ from stereovox.cameras.wide import COUNTS, CylindricalCamera, Lens, SphericalCam
 from stereovox.errors import FrameRefused, SourceError, StereovoxError, did_you_mean
 from stereovox.files.safe_io import is_number, replacing, shown, toml_text
 from stereovox.geometry.se3 import Transform, orthonormalise, rigidity_error
-from stereovox.sources.images import read_picture_png
+from stereovox.sources.photos import read_picture_png
 
 FILE = "rig.toml"
 CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}

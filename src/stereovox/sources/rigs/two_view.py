@@ -17,8 +17,8 @@ from stereovox.config.maps import StereoConfig
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.files.safe_io import read_text
 from stereovox.sources.base import Part
-from stereovox.sources.images import EYE_KINDS, png_size
 from stereovox.sources.kitti.poses import UPRIGHT
+from stereovox.sources.photos import EYE_KINDS, png_size
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rigs.rig import RigSource, Shot

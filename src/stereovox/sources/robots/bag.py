@@ -24,8 +24,7 @@ from stereovox.sources.base import Lazy
 from stereovox.sources.parameters import mounted
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.tracker import AXES
-from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
-from stereovox.sources.robots.frames import FrameOptions, RobotFrames
+from stereovox.sources.robots.frames import CloudBand, FrameOptions, RobotFrames, scan_of_cloud
 
 NO_POSE = np.full((4, 4), np.nan)
 T_BODY_OPTICAL = np.eye(4)

@@ -16,14 +16,13 @@ from stereovox.geometry.se3 import inverse, transform_points
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.calibration.intrinsics import metres_per_unit, scaled
-from stereovox.sources.images import spread
+from stereovox.sources.photos import spread
 from stereovox.sources.poses.trajectory import inside
-from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, depth_size, read_depth
+from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, Undistortion, depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import unit_words
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.layouts.colmap_model import UNDISTORT, ColmapImage, ColmapModel, read_model
 from stereovox.sources.rgbd.pose_files import ImagePoses, number_in
-from stereovox.sources.rgbd.undistort import Undistortion
 
 ROOTS = ("dense", "dense/0", "")
 """Possible places of COLMAP's own depth maps: `ROOT/stereo/depth_maps`."""

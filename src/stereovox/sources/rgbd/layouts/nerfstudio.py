@@ -17,10 +17,9 @@ from stereovox.geometry.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.poses.trajectory import inside
-from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth
+from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, Undistortion
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import ImagePoses, number_in
-from stereovox.sources.rgbd.undistort import Undistortion
 
 FILE = "transforms.json"
 DEPTH_KEYS = ("depth_file_path", "depth_path")

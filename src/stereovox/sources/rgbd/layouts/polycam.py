@@ -16,8 +16,7 @@ from stereovox.geometry.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.calibration.intrinsics import scaled
-from stereovox.sources.rgbd.confidence import without_low
-from stereovox.sources.rgbd.depth_files import Depth
+from stereovox.sources.rgbd.depth_files import Depth, without_low
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, images_in
 from stereovox.sources.rgbd.pose_files import ImagePoses
 

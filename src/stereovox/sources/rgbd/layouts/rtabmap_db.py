@@ -19,7 +19,7 @@ from stereovox.errors import FrameRefused, SourceError, one_line
 from stereovox.geometry.se3 import Transform
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.calibration.intrinsics import scaled
-from stereovox.sources.images import MAX_BYTES, decode_rvl, size_text
+from stereovox.sources.photos import MAX_BYTES, decode_rvl, size_text
 from stereovox.sources.rgbd.depth_files import Depth, decode_depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import ImagePoses

@@ -16,7 +16,7 @@ from stereovox.geometry.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, camera_in, find_camera, pinhole
 from stereovox.sources.calibration.intrinsics import NAMES
-from stereovox.sources.images import file_names
+from stereovox.sources.photos import file_names
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import read_pose
 

@@ -12,10 +12,9 @@ from stereovox.geometry.se3 import Transform, from_quaternion
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, pinhole
 from stereovox.sources.calibration.intrinsics import read_intrinsics, scaled
-from stereovox.sources.images import file_names
+from stereovox.sources.photos import file_names
 from stereovox.sources.poses.trajectory import ns_from_seconds
-from stereovox.sources.rgbd.confidence import without_low
-from stereovox.sources.rgbd.depth_files import Depth
+from stereovox.sources.rgbd.depth_files import Depth, without_low
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import ImagePoses
 

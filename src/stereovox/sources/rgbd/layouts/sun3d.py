@@ -10,7 +10,7 @@ import numpy as np
 
 from stereovox.errors import SourceError
 from stereovox.sources.base import Part
-from stereovox.sources.images import file_names
+from stereovox.sources.photos import file_names
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part

@@ -12,8 +12,7 @@ from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.calibration.camera_file import FoundCamera, find_camera
 from stereovox.sources.calibration.intrinsics import NAMES
-from stereovox.sources.images import file_names
-from stereovox.sources.photos import FOLDERS
+from stereovox.sources.photos import FOLDERS, file_names
 from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
 from stereovox.sources.poses.poses import Poses
 from stereovox.sources.poses.trajectory import (

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts shared by the calibration commands: recordings of walls with their distances, and checks of output files.
-
-Parts shared by the commands for ground robots: recordings, settings, and the files they write.
-"""
+"""Options shared by commands: recordings of walls, recordings of robots, and checks of the files they write."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of maps: sensor model, integrators, cells, the window.
+"""Settings of depth images (noise, stereo matching, sphere) and of maps (sensor model, integrator, cells, window).
 
-The base class of all settings sections. Settings of depth images: their noise, stereo matching, the spherical grid.
+Every section inherits from the base class here.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a ground robot: scans from depth images, 2-D grids, localisation, SLAM. Part of `config.Config`.
-
-Settings of trust and deadline: which frames may change a map, and what is left out when time is short.
-"""
+"""Settings of a ground robot (scans, 2-D grids, localisation, SLAM), of trust in frames, and of deadlines."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map's decision on each cell (occupied, tentative, free, unknown) against the truth: its error rates.
+"""A map's decision on each cell (occupied, tentative, free, unknown) against the truth, and its error rates.
 
-The decisions of a map by range, by thickness of the surface, and by number of looks. The table of decisions in words,
-for the terminal and for pages. Classify each cell as right or wrong, for pictures. Number of places on a map's own path
-from which each true surface cell could be seen.
+The rates of all cells, and by range, by thickness of the surface and by number of looks; as tables for the terminal and
+for pages, and cell by cell for pictures.
 """
 
 from __future__ import annotations

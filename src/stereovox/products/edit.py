@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a map inside a box.
-
-A map in larger cells. Merge two maps by adding their evidence.
-"""
+"""Make a map from others: crop to a box, coarsen to larger cells, merge by adding evidence."""
 
 from __future__ import annotations
 

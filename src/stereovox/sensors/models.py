@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default model: a hit counts by the probability that it is in its cell; clearing counts less than hits.
+"""The inverse sensor models: the default, Andert's (Chien 2020), Valenti's (2018), OctoMap's constants, and a cone's.
 
-Andert's inverse sensor model as Chien 2020 uses it. The inverse sensor model of Valenti 2018. The constant hit / miss
-model of OctoMap. The model of a sensor with a cone: something is at the measured distance, somewhere on an arc.
+The default counts a hit by the probability that it is in its cell, and clears less than it marks.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts shared by all pictures: figures with a headline, legends, axes, saving.
-
-Panels of a picture: a view of the occupied cells, and a slice with all four states. Dark pictures: a finished figure
-with its page, letters and flat colours replaced; drawing code has no themes.
-"""
+"""Parts shared by all pictures: figures with a headline, legends, axes, panels, saving, dark versions."""
 
 from __future__ import annotations
 

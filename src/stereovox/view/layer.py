@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scale of displayed log-odds, with colours: plain, or as the bytes that a map stores.
+"""Pictures of the log-odds of a map: one layer in colours and as a landscape, and the values along the optical axis.
 
-The log-odds of a layer as a landscape of columns: valleys are free, towers occupied (Chien 2020, Fig 4.6, below). Log-
-odds along the optical axis of the camera (Chien 2020, Fig 4.6, top right). One layer of a map: its states as a plan,
-its log-odds in colours and as a landscape (Chien 2020, Fig 4.6).
+As Chien 2020, Fig 4.6. Colours show log-odds, or the bytes that a map stores.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of the viewer's panel: statistics, colour bars, and the log-odds along the optical axis.
-
-Distance measurement in the viewer: two clicks on cells, a line between them, and its length. One layer of cells in the
-viewer: a plane coloured by log-odds, moved through the map by sliders.
-"""
+"""Panels of the viewer: statistics, colour bars, log-odds along the optical axis, distance measurement, and layers."""
 
 from __future__ import annotations
 

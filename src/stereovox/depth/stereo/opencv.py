@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCV's matchers: semi-global matching (Hirschmueller 2008) along three, four or eight paths, and plain blocks.
-
-A user's stereo network in an ONNX file: two images in, a disparity out.
-"""
+"""Matchers of others: OpenCV's semi-global matching (Hirschmueller 2008) and blocks, and a user's ONNX network."""
 
 from __future__ import annotations
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
@@ -23,6 +22,9 @@ from stereovox.sources.poses.tracker import AXES
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.depth_unit import View, difference, find_unit, is_likely, pairs_of
 from stereovox.sources.rgbd.pose_files import in_optical_axes, in_other_hand
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 POSE_SCALES = (1.0, 0.001, 0.01)
 """Metres per unit of poses that are tried."""
@@ -212,6 +214,8 @@ def clouds_misfit(read: Callable[[int], NDArray[np.floating]], raw: Callable[[in
         count: Number of clouds.
         now: The current reading of the poses.
     """
+    from scipy.spatial import KDTree
+
     pairs, below = [], list[float]()
     for first in np.unique(np.linspace(0, count - 2, CLOUD_PAIRS).astype(int)).tolist() if count > 1 else []:
         with suppress(FrameRefused):

@@ -289,9 +289,10 @@ def missing_outputs(table, topics):
     public = {f"sv.{name}" for name, home in sv._HOMES.items() if home.startswith(HOMES) and name not in NO_OUTPUT}
     formats = {f"format {ending}" for ending in EXPORTS}
     live = {
-        f"live.{name}" for name, one in vars(live_outputs).items()
+        f"live.{name}"
+        for name, one in vars(live_outputs).items()
         if isinstance(one, type) and one.__module__ == live_outputs.__name__ and hasattr(one, "after")
-    } - {"live.Output", "live._Mark"}  # fmt: skip; a mark only measures time
+    } - {"live.Output", "live._Mark"}  # a mark only measures time
     return sorted((public | formats | live | topics) - set(table))
 
 

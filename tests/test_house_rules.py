@@ -23,8 +23,8 @@ COMMANDS = {
 }
 
 MOST = {
-    "modules": 484,
-    "lines": 93_120,
+    "modules": 485,
+    "lines": 93_130,
     "loose modules at the root": 7,
     "rooms": 34,
     "floors": 15,

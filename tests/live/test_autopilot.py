@@ -24,7 +24,7 @@ from stereovox.mavlink.pose_sender import upper_triangle
 from stereovox.mavlink.sectors import SectorRules
 from stereovox.mavlink.sending import ObstacleSender
 from stereovox.opening import open_source
-from stereovox.runs.warm_up import TRACK
+from stereovox.runs.pose_choice import TRACK
 from stereovox.sources.base import Stream
 from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.track.tracker import Tracked

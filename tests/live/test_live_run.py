@@ -30,7 +30,7 @@ from stereovox.mapper import Mapper
 from stereovox.maps import State, load_map
 from stereovox.opening import open_source
 from stereovox.products.projection import project
-from stereovox.runs.warm_up import GIVEN, TRACK
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.base import Stream
 from stereovox.sources.paced import Paced

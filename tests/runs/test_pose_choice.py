@@ -13,8 +13,8 @@ from made_unposed import ROOM, room, unposed
 
 from stereovox.errors import NoPoses, SourceError, StereovoxError
 from stereovox.opening import open_images, open_source
-from stereovox.runs import warm_up
-from stereovox.runs.warm_up import choose_poses
+from stereovox.runs import pose_choice
+from stereovox.runs.pose_choice import choose_poses
 from stereovox.sources.latest import LatestStream
 
 
@@ -94,7 +94,7 @@ class Camera:
 @pytest.mark.parametrize("posed", [True, False])
 def test_a_live_camera_says_whether_it_knows_where_it_is(monkeypatch, posed):
     opened = []
-    monkeypatch.setattr(warm_up.opening, "open_stream", lambda *_: opened.append(1) or LatestStream(Camera(posed)))
+    monkeypatch.setattr(pose_choice.opening, "open_stream", lambda *_: opened.append(1) or LatestStream(Camera(posed)))
     chosen = choose_poses("realsense:", None, None)
     assert (chosen.poses, bool(chosen.why), len(opened)) == ("given" if posed else "track", not posed, 1)
 

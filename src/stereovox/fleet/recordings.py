@@ -37,8 +37,8 @@ from stereovox.maps.record.frame_store import IN_A_PACK, files_of_frames, read_f
 from stereovox.maps.record.kept_frames import KeptFrame, digest_of
 from stereovox.maps.storage.boxes import BoxLayout
 from stereovox.opening import is_recording
+from stereovox.runs.pose_choice import GIVEN
 from stereovox.runs.recording import MapRun
-from stereovox.runs.warm_up import GIVEN
 from stereovox.sources.bags.recording import file_part
 
 VERSION = 2

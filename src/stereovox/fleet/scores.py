@@ -29,8 +29,8 @@ from stereovox.maps.files.boxed_manifest import only_writer_at
 from stereovox.maps.files.store import MANIFEST
 from stereovox.opening import open_source
 from stereovox.runs.engine import ended_in_order
+from stereovox.runs.pose_choice import GIVEN
 from stereovox.runs.recording import MapRun
-from stereovox.runs.warm_up import GIVEN
 
 VERSION = 2
 """Version of a stored score; others are redone."""

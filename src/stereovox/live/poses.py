@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from stereovox import registry
 from stereovox.errors import SourceError
-from stereovox.runs.warm_up import GIVEN, TRACK
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.poses.pose_stream import PoseStream
 
 POSES = {

@@ -20,8 +20,9 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.products.floor_axes import Heights
 from stereovox.runs.engine import MapOptions, Observer, Run, RunResult, takes
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.runs.recording import MapRun
-from stereovox.runs.warm_up import GIVEN, TRACK, warm_up
+from stereovox.runs.warm_up import warm_up
 from stereovox.sources.base import Stream
 from stereovox.sources.poses.live_poses import LivePoses
 from stereovox.sources.poses.pose_stream import PoseStream

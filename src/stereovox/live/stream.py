@@ -25,8 +25,8 @@ from stereovox.frame.stamp_clock import epoch_ns
 from stereovox.geometry.se3 import Transform, covariance_at, inverse
 from stereovox.live.rig import LiveCamera, check_cameras
 from stereovox.opening import open_camera, open_images
+from stereovox.runs.pose_choice import GIVEN, HOW, TRACK, has_poses
 from stereovox.runs.survey import level_pose
-from stereovox.runs.warm_up import GIVEN, HOW, TRACK, has_poses
 from stereovox.sources.base import Stream, closing, stream_of
 from stereovox.sources.imu import Imu
 from stereovox.sources.latest import STOPPING_S, Arrival, Latest, Waiting

@@ -18,7 +18,7 @@ from stereovox.cameras.lidar import USUAL_SIGMA_M
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.files.safe_io import FLOOR_READABLE
 from stereovox.localize.robot_track import parse_start
-from stereovox.runs.warm_up import GIVEN, TRACK
+from stereovox.runs.pose_choice import GIVEN, TRACK
 from stereovox.sources.clouds.options import LidarOptions
 
 PREFIX = "ros."

@@ -24,7 +24,8 @@ from stereovox.ros.node import MapNode
 from stereovox.ros.options import OUT, SLAM, Options, freeze
 from stereovox.ros.poses.corrections import check_corrections
 from stereovox.runs.engine import Checkpoints, MapOptions, Run
-from stereovox.runs.warm_up import NOT_COMPARED, TRACK, uncompared, warm_up
+from stereovox.runs.pose_choice import NOT_COMPARED, TRACK, uncompared
+from stereovox.runs.warm_up import warm_up
 
 MAX_REPORTS = 10_000
 """Most recent frames whose times are summarised at the end."""

@@ -18,7 +18,7 @@ from stereovox.ros.inputs import DepthInput, Input
 from stereovox.ros.options import Options, split_pair
 from stereovox.ros.poses.poses import PoseBuffer
 from stereovox.ros.poses.tf_message import tf_message
-from stereovox.runs.warm_up import TRACK
+from stereovox.runs.pose_choice import TRACK
 
 FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""

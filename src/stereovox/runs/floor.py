@@ -31,8 +31,8 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_robot, parse_slice
 from stereovox.runs.engine import Checkpoints, MapOptions, MapperRun, Observer, takes
+from stereovox.runs.pose_choice import NOT_COMPARED, uncompared
 from stereovox.runs.recording import MapResult
-from stereovox.runs.warm_up import NOT_COMPARED, uncompared
 from stereovox.sources.robots.robot import Robot, in_time_order
 
 SLAM, ODOMETRY = "slam", "odometry"

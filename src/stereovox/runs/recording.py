@@ -42,8 +42,8 @@ from stereovox.runs.engine import (
     frames_offered,
     takes,
 )
+from stereovox.runs.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.runs.survey import LEVELLED, TILTED, level_start, survey
-from stereovox.runs.warm_up import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.paced import Turned
 from stereovox.track.inertial import imu_and_note

@@ -23,8 +23,8 @@ from stereovox.geometry.se3 import Transform
 from stereovox.kernels.threads import expecting
 from stereovox.opening import open_source
 from stereovox.runs.engine import SURVEYED, Checkpoints, Run, RunOptions, takes
+from stereovox.runs.pose_choice import TRACK, choose_poses
 from stereovox.runs.survey import level_start, survey
-from stereovox.runs.warm_up import TRACK, choose_poses
 from stereovox.sources.base import Source, Stream, prefetch
 from stereovox.sources.calibration.camera_file import with_camera
 from stereovox.sources.poses.poses import Poses

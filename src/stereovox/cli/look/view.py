@@ -86,7 +86,7 @@ def silence_server_log() -> None:
 
 def _check_poses(recording: str) -> None:
     """Raise StereovoxError for a map whose poses are not its recording's own."""
-    from stereovox.runs.warm_up import GIVEN, poses_of
+    from stereovox.runs.pose_choice import GIVEN, poses_of
 
     if poses_of(recording) != GIVEN:
         raise StereovoxError(f"--recording: the map was made of '{recording}', with poses that it lacks; leave it out")

@@ -26,7 +26,7 @@ from stereovox.ros.poses.localization import (
 from stereovox.ros.poses.location_topics import InitialPose, Late, LocationTopics, MotionPublisher, never_late
 from stereovox.ros.poses.poses import PoseBuffer
 from stereovox.ros.poses.tracking import TrackedDepthInput, TrackedPoses, Tracking
-from stereovox.runs.warm_up import GIVEN, TRACK
+from stereovox.runs.pose_choice import GIVEN, TRACK
 
 SLAM_MAP_S = 2.0
 """Least seconds between two maps of SLAM."""

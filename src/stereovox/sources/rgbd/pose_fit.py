@@ -47,8 +47,9 @@ CLOUD_PAIRS, LATER, CLOUD_TURN, KEPT, ASKED, FEW_POINTS = 6, 10, 0.15, 20_000, 5
 of each: kept, compared, and least."""
 NEIGHBOURS, FLAT = 8, 0.1
 """Points of a local plane, and least ratio of its second to its first variance."""
-SURE_PAIRS, CLOUDS_MOVE = 0.7, 1.2
-"""Share of the pairs that must support another reading, and by how much it must fit better than a lidar at rest."""
+SURE_PAIRS, CLOUDS_MOVE, OFF_SURFACE = 0.7, 1.2, 0.1
+"""Share of the pairs that must support another reading, by how much it must fit better than a lidar at rest, and metres
+by which points are off if a lidar at rest fits better: on a straight road its rings always do."""
 OFF_LEVEL, ALL_ABOVE = 0.3, 0.9
 """Metres by which points are above or below a lidar, and by how much more are above if it is upside down."""
 
@@ -232,12 +233,10 @@ def clouds_misfit(read: Callable[[int], NDArray[np.floating]], raw: Callable[[in
     still = np.array([_off_surface(ours, tree) for ours, tree, *_ in pairs])
     usual, found = (float(np.median(fits[reading])) for reading in (now, best))
     said = f"poses do not fit the clouds: points are {usual:.2g} m apart from cloud to cloud"
-    if CLOSER * found < usual and np.mean(CLOSER * fits[best] < fits[now]) > SURE_PAIRS:
-        moves = np.median(still) > CLOUDS_MOVE * found
-        return f"{said}; try ?{now.options(best)}, with which they are {found:.2g} m apart" if moves else (
-            f"{said}, {np.median(still):.2g} m if the lidar had not moved; check that poses belong to these clouds"
-        )  # fmt: skip
-    if CLOSER * np.median(still) < usual:
+    clearly = CLOSER * found < usual and np.mean(CLOSER * fits[best] < fits[now]) > SURE_PAIRS
+    if clearly and np.median(still) > CLOUDS_MOVE * found:
+        return f"{said}; try ?{now.options(best)}, with which they are {found:.2g} m apart"
+    if usual > OFF_SURFACE and (clearly or CLOSER * np.median(still) < usual):
         return f"{said}, {np.median(still):.2g} m if the lidar had not moved; check that poses belong to these clouds"
     if below and np.median(below) < -ALL_ABOVE and not now.mounted:
         return f"nearly all points are above the lidar; if it is upside down, try ?{now.turned}"

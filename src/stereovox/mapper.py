@@ -35,7 +35,6 @@ from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.record.health import Health
-from stereovox.maps.record.history import TRIES
 from stereovox.maps.record.kept_frames import Packed, PackedCloud, kept_frame, packed_of
 
 SeenT = TypeVar("SeenT", contravariant=True)
@@ -142,10 +141,8 @@ class Mapper(Aged):
         self._deadline = Deadline(self.config)
         self._levels, self._tiles, self._correcting = Levels(self.config), tiles, MapLock()
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
-        self._intake = Intake(self.config, self.map, clock, stamp_clock)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock, is_new=resume is None)
         self._comparison = Comparison(self.config, self._intake.gate)
-        if resume is None and self.config.trust.max_disagreement < 1:
-            self.map.history.unconfirmed = TRIES
 
     def add(self, frame: AnyFrame) -> UpdateReport:
         """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
@@ -300,10 +297,8 @@ class GridMapper(Aged):
         self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)
-        self._intake = Intake(self.config, self.map, clock, stamp_clock)
+        self._intake = Intake(self.config, self.map, clock, stamp_clock, is_new=resume is None)
         self._comparison = FloorComparison(self.config, self._intake.gate, isinstance(resume, OccupancyGrid))
-        if resume is None and self.config.trust.max_disagreement < 1:
-            self.map.history.unconfirmed = TRIES
 
     def add(self, frame: Scan | AnyFrame) -> UpdateReport:
         """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.

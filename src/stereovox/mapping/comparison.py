@@ -22,7 +22,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.cells.evidence import Evidence
 from stereovox.maps.query.queries import RayHits
 from stereovox.maps.record.glance import Glance, Votes
-from stereovox.maps.record.history import DisagreementSpell
+from stereovox.maps.record.history import DisagreementSpell, History
 from stereovox.maps.voxel_map import leaning
 from stereovox.sensors import make_sensor
 from stereovox.sensors.noise import RangeNoise
@@ -127,18 +127,13 @@ class Comparison:
         points, history = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), voxel_map.history
         sigma = self._noise[image.camera].sigma(np.linalg.norm(points, axis=1))
         sharp = sigma <= BLURRED * voxel_map.voxel_size
-        is_sharp = np.count_nonzero(sharp) >= FEW
+        is_sharp = bool(np.count_nonzero(sharp) >= FEW)
         points, sigma = (thinned(values[sharp] if is_sharp else values, POINTS) for values in (points, sigma))
         tolerance, tries = np.maximum(voxel_map.voxel_size, (SPREAD if is_sharp else 1) * sigma), 1 + 2 * SPREAD
         with voxel_map.lock:
-            placed, frames = _placed(voxel_map, image.T_world_sensor, points, tolerance, tries), history.frames
-        agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
-        enough = frames - history.cones.total() >= ENOUGH
-        if known < max(FEW, OVERLAP * len(points)):
-            return passed._replace(confirms=enough)
-        if is_sharp and agree < (CONFIRMED if known >= MOST * len(points) else CONTRADICTED) * known:
-            return passed._replace(takes_out=frames, glances=())
-        return passed._replace(confirms=enough or agree >= CONFIRMED * known)
+            placed = _placed(voxel_map, image.T_world_sensor, points, tolerance, tries)
+            agree, known = int(placed.agrees.sum()), int((placed.agrees | placed.against).sum())
+            return judged(passed, history, agree, known, len(points), is_sharp)
 
     def _prepare(self, voxel_map: VoxelMap, image: AnyImage) -> None:
         """Inspect the first image, so that kernels compile now and not when a frame is in doubt."""
@@ -151,6 +146,22 @@ class Comparison:
         """Return how a frame in doubt fits the map; the work does not depend on the size of the image."""
         seen, sigma = _sampled(image, GLANCED, FARTHEST * voxel_map.config.max_range), self._noise[image.camera].sigma
         return sight(voxel_map, image.T_world_sensor, seen, sigma, doubt, partial(_fault, voxel_map, image))
+
+
+def judged(
+    passed: GateResult, history: History, agree: int, known: int, seen: int, contradicts: bool = True
+) -> GateResult:
+    """Return the result for a frame whose map is of frames that none has confirmed; the map's lock must be held.
+
+    agree: how many of the `known` points, or beams, agree with the map. seen: all of the frame. contradicts: whether
+    the others contradict it.
+    """
+    enough = history.frames - history.cones.total() >= ENOUGH
+    if known < max(FEW, OVERLAP * seen):
+        return passed._replace(confirms=enough)
+    if contradicts and agree < (CONFIRMED if known >= MOST * seen else CONTRADICTED) * known:
+        return passed._replace(takes_out=history.frames, glances=())
+    return passed._replace(confirms=enough or agree >= CONFIRMED * known)
 
 
 class Surfaces(Protocol):

@@ -14,19 +14,15 @@ from stereovox.frame import AnyFrame, Scan
 from stereovox.geometry import se2
 from stereovox.geometry.se3 import Transform, rotation_matrix
 from stereovox.mapping.comparison import (
-    CONFIRMED,
-    CONTRADICTED,
-    ENOUGH,
     GAIN,
-    MOST,
-    OVERLAP,
     TRIED,
     Placed,
     explained,
+    judged,
     sight,
     thinned,
 )
-from stereovox.mapping.disagreement import FEW, Sight
+from stereovox.mapping.disagreement import Sight
 from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps.cells.cell_format import State
 from stereovox.maps.cells.evidence import GridEvidence
@@ -102,14 +98,9 @@ class FloorComparison:
     def _confirmed(self, evidence: GridEvidence, passed: GateResult, grid_map: GridMap) -> GateResult:
         """Return the result for a scan whose map is of scans that none has confirmed, as `Comparison` does."""
         with grid_map.lock:
-            met, frames = grid_map.storage.agreement(evidence, self._around, sure=False), grid_map.history.frames
-            enough = frames - grid_map.history.cones.total() >= ENOUGH
-        known = met.agree + met.into_free + met.through
-        if known < max(FEW, OVERLAP * met.every):
-            return passed._replace(confirms=enough)
-        if met.agree < (CONFIRMED if known >= MOST * met.every else CONTRADICTED) * known:
-            return passed._replace(takes_out=frames)
-        return passed._replace(confirms=enough or met.agree >= CONFIRMED * known)
+            met = grid_map.storage.agreement(evidence, self._around, sure=False)
+            known = met.agree + met.into_free + met.through
+            return judged(passed, grid_map.history, met.agree, known, met.every)
 
     def _sight(self, scan: Scan, doubt: DisagreementSpell | None, grid_map: GridMap) -> Sight:
         """Return how a scan in doubt fits the grid."""

@@ -16,12 +16,15 @@ from stereovox.mapping.gate import Gate, GateResult
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.record.health import FULL, Health, HealthMonitor
+from stereovox.maps.record.history import TRIES
 
 
 class Intake:
     """Entrance for frames of one map: one frame at a time.
 
     A refused frame (FrameRefused) is counted in the map's history and changes nothing else.
+
+    is_new: whether the map begins with these frames; it is then provisional until two of them agree.
 
     Attributes:
         gate: Compares each frame with earlier ones; its memory is the map's history.
@@ -34,7 +37,10 @@ class Intake:
         target: VoxelMap | GridMap,
         clock: Callable[[], int],
         stamps_by: StampsBy,
+        is_new: bool,
     ):
+        if is_new and config.trust.max_disagreement < 1:
+            target.history.unconfirmed = TRIES
         self.gate = Gate(config, target.history)
         self.monitor = HealthMonitor(config, clock, stamps_by, epoch_ns)
         self._map, self._adding = target, MapLock()

@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of a robot's track on a floor: ATE, RPE, and known relations between pairs of poses; in space: see
-trajectory_score.py.
+"""Errors of a robot's track on a floor: ATE, RPE, and known relations; and pose pairs of trajectories by their times.
 
-Our own implementation, because evo is GPL-3 and this is Apache-2.0.
-
-Poses of an estimated trajectory paired with the true ones of the same times.
+Errors in space: see `trajectory_score`. Our own implementation, because evo is GPL-3 and this is Apache-2.0.
 """
 
 from __future__ import annotations
